@@ -55,9 +55,7 @@ def enu_from_azimuth_elevation(azimuth_rad: npt.ArrayLike, elevation_rad: npt.Ar
     -------
     (..., xyz)
     """
-    azimuth, elevation = np.broadcast_arrays(
-        np.asarray(azimuth_rad, np.float64), np.asarray(elevation_rad, np.float64)
-    )
+    azimuth, elevation = np.broadcast_arrays(np.asarray(azimuth_rad, np.float64), np.asarray(elevation_rad, np.float64))
     return np.stack(
         [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
     )

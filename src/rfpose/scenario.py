@@ -148,9 +148,7 @@ class Heliostat(_Record):
         if len(self.receiver_ids) != n:
             raise ValueError(f"`receiver_ids` must name all {n} receivers, got {len(self.receiver_ids)}")
         if geometry.is_collinear(self.receiver_mirror_m):
-            raise ValueError(
-                "`receiver_mirror_m` must not lie on a line: a line fixes no normal; move one aside"
-            )
+            raise ValueError("`receiver_mirror_m` must not lie on a line: a line fixes no normal; move one aside")
         if self.normal_enu is not None and math.hypot(*self.normal_enu) < 1e-9:
             raise ValueError("`normal_enu` must not be zero")
         return self
@@ -363,9 +361,7 @@ def _check_transmitters_apart(s: Scenario) -> None:
     for (i, a), (j, b) in itertools.combinations(enumerate(s.transmitter_enu_m), 2):
         if np.linalg.norm(a - b) < 1e-6:
             ids = s.transmitter_ids
-            raise ValueError(
-                f"transmitters `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one"
-            )
+            raise ValueError(f"transmitters `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one")
 
 
 def _check_lines_in_band(s: Scenario) -> None:
@@ -408,9 +404,7 @@ def _check_simulation_names(s: Scenario) -> None:
     receivers = set(s.receiver_ids)
     for blockage in s.simulation.blocked:
         if blockage.transmitter not in s.transmitter_ids:
-            raise ValueError(
-                f"simulation.blocked names transmitter `{blockage.transmitter}`, which does not exist"
-            )
+            raise ValueError(f"simulation.blocked names transmitter `{blockage.transmitter}`, which does not exist")
         for identifier in blockage.receivers:
             if identifier not in receivers and identifier not in s.heliostat_ids:
                 raise ValueError(f"simulation.blocked names receiver `{identifier}`, which does not exist")

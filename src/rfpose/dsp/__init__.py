@@ -1,1 +1,1 @@
-
+"""IQ to tone phases."""

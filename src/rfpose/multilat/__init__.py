@@ -1,1 +1,1 @@
-
+"""Range differences to receiver positions, and those to mirror normals."""

@@ -1,1 +1,1 @@
-
+"""IQ on disk: rfpose-iq (HDF5), Digital RF, SigMF."""

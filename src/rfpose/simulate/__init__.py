@@ -1,1 +1,1 @@
-
+"""Synthetic recordings, from a time-domain sum of rays."""
