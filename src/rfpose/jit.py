@@ -10,14 +10,13 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
-from numba.core import config
 
 __all__ = ["kernel", "kernel_fast", "kernel_inline", "kernel_parallel", "kernel_parallel_fast"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 # OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
-config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 
 # Reordering and contraction let sums vectorise. "nnan" and "ninf" stay off: NaN is a mark here.
 _REORDER = {"reassoc", "contract", "arcp", "nsz"}

@@ -371,8 +371,9 @@ def _check_lines_in_band(s: Scenario) -> None:
         worst = float(np.max(np.abs(lines)))
         if worst + margin >= half_band:
             raise ValueError(
-                f"transmitter `{transmitter.id}` has a line {worst:.9g} Hz from the centre, outside the recorded band of "
-                f"±{half_band:.9g} Hz (less {margin:.4g} Hz for clock offset); move `carrier_hz` or raise `sample_rate_hz`"
+                f"transmitter `{transmitter.id}` has a line {worst:.9g} Hz from the centre, outside the recorded band "
+                f"of ±{half_band:.9g} Hz (less {margin:.4g} Hz for clock offset); move `carrier_hz` or raise "
+                "`sample_rate_hz`"
             )
 
 
@@ -386,8 +387,8 @@ def _check_lines_apart(s: Scenario) -> None:
     if tight.size:
         a, b = (divmod(int(order[k]), n_line) for k in (tight[0], tight[0] + 1))
         raise ValueError(
-            f"lines of transmitters `{s.transmitter_ids[a[0]]}` and `{s.transmitter_ids[b[0]]}` are {gap[tight[0]]:.6g} Hz apart "
-            f"and collide: a frame of {s.radio.frame_samples} samples resolves {resolution:.6g} Hz and needs twice "
+            f"lines of transmitters `{s.transmitter_ids[a[0]]}` and `{s.transmitter_ids[b[0]]}` are "
+            f"{gap[tight[0]]:.6g} Hz apart and collide: a frame of {s.radio.frame_samples} samples resolves {resolution:.6g} Hz and needs twice "
             "that; move a carrier, change a tone, or lengthen the frame"
         )
 
