@@ -388,8 +388,8 @@ def _check_lines_apart(s: Scenario) -> None:
         a, b = (divmod(int(order[k]), n_line) for k in (tight[0], tight[0] + 1))
         raise ValueError(
             f"lines of transmitters `{s.transmitter_ids[a[0]]}` and `{s.transmitter_ids[b[0]]}` are "
-            f"{gap[tight[0]]:.6g} Hz apart and collide: a frame of {s.radio.frame_samples} samples resolves {resolution:.6g} Hz and needs twice "
-            "that; move a carrier, change a tone, or lengthen the frame"
+            f"{gap[tight[0]]:.6g} Hz apart and collide: a frame of {s.radio.frame_samples} samples resolves "
+            f"{resolution:.6g} Hz and needs twice that; move a carrier, change a tone, or lengthen the frame"
         )
 
 
