@@ -1,1 +1,18 @@
-"""IQ on disk: rfpose-iq (HDF5), Digital RF, SigMF."""
+"""IQ on disk: rfpose-iq (HDF5), Digital RF, SigMF.
+
+`open_recording` reads any of them, `RecordingWriter` writes the first, `convert` goes between them.
+"""
+
+from rfpose.recording.base import GapError, Recording, count_fill, frame_starts, recorded_runs
+from rfpose.recording.opening import open_recording
+from rfpose.recording.writer import RecordingWriter
+
+__all__ = [
+    "GapError",
+    "Recording",
+    "RecordingWriter",
+    "count_fill",
+    "frame_starts",
+    "open_recording",
+    "recorded_runs",
+]

@@ -1,0 +1,327 @@
+"""What every recording offers, whatever file format lies beneath."""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import read_only
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.recording import keys
+from rfpose.scenario import Scenario
+from rfpose.truth import Truth
+
+__all__ = [
+    "COMPONENT_DTYPE",
+    "COMPOUND_DTYPE",
+    "FILL_VALUE",
+    "GapError",
+    "IqArray",
+    "Recording",
+    "RecordingFormat",
+    "SampleFormat",
+    "as_compound",
+    "count_fill",
+    "frame_starts",
+    "recorded_runs",
+]
+
+_log = logging.getLogger(__name__)
+
+RecordingFormat = Literal["rfpose-iq", "digital-rf", "sigmf"]
+SampleFormat = Literal["int16", "complex64"]
+IqArray = npt.NDArray[Any]
+"""(sample, 2) in-phase and quadrature: int16 counts or float32."""
+IndexArray = npt.NDArray[np.int64]
+
+COMPONENT_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
+    "int16": np.dtype("<i2"),
+    "complex64": np.dtype("<f4"),
+}
+COMPOUND_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
+    name: np.dtype([(keys.REAL, component), (keys.IMAG, component)]) for name, component in COMPONENT_DTYPE.items()
+}
+FILL_VALUE: Final[Mapping[str, float]] = {"int16": -(2**15), "complex64": float("nan")}
+"""What stands in I and in Q where a file has room for a sample that was never written; Digital RF's choice too."""
+
+
+class GapError(RecordingError):
+    """Samples were asked for that the receiver did not record."""
+
+
+def as_compound(iq: IqArray, sample_format: str) -> npt.NDArray[Any]:
+    """Return a (sample,) view of ``iq`` (sample, 2) with fields ``r`` and ``i``; no copy is made."""
+    return iq.view(COMPOUND_DTYPE[sample_format]).reshape(-1)
+
+
+def count_fill(iq: IqArray) -> int:
+    """Count samples of ``iq`` (sample, 2) whose I and Q both hold the fill value of their type.
+
+    A recorder that fills holes instead of leaving gaps shows them this way. Int16 counts of −32768 in both
+    components are taken for fill, so a digitiser should clip at ±32767.
+    """
+    if iq.dtype.kind == "f":
+        return int(np.count_nonzero(np.isnan(iq[:, 0]) & np.isnan(iq[:, 1])))
+    lowest = np.iinfo(iq.dtype).min
+    return int(np.count_nonzero((iq[:, 0] == lowest) & (iq[:, 1] == lowest)))
+
+
+class Recording(ABC):
+    """IQ of several receivers on one sample grid, read by absolute sample index.
+
+    A sample's index counts from the Unix epoch at the nominal sample rate, so that sample ``k`` was taken at
+    ``k / sample_rate`` seconds of the receivers' common time. Open one with `open_recording`; use it as a
+    context manager. Nothing is held in memory but the table of blocks.
+
+    Attributes
+    ----------
+    path
+        What was opened.
+    format
+        ``"rfpose-iq"``, ``"digital-rf"`` or ``"sigmf"``.
+    receiver_ids
+        Receivers in file order.
+    sample_rate
+        Exact rate [1/s].
+    centre_frequency_hz
+        Radio frequency at baseband zero [Hz]; None when the file does not say.
+    sample_format
+        ``"int16"`` (`read` gives int16 counts) or ``"complex64"`` (`read` gives float32).
+    full_scale
+        Largest magnitude that an I or Q component can take; infinite when there is no such limit.
+    scenario
+        The site: as given by the caller, else as found in the recording, else None.
+    truth
+        What was simulated; None for a real recording.
+    provenance
+        How the recording came about, free text by name.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        format: RecordingFormat,
+        receiver_ids: tuple[str, ...],
+        sample_rate: Fraction,
+        centre_frequency_hz: float | None,
+        sample_format: SampleFormat,
+        full_scale: float,
+        scenario: Scenario | None = None,
+        truth: Truth | None = None,
+        provenance: Mapping[str, str] | None = None,
+    ) -> None:
+        self.path = path
+        self.format: RecordingFormat = format
+        self.receiver_ids = receiver_ids
+        self.sample_rate = sample_rate
+        self.centre_frequency_hz = centre_frequency_hz
+        self.sample_format: SampleFormat = sample_format
+        self.full_scale = full_scale
+        self.scenario = scenario
+        self.truth = truth
+        self.provenance: dict[str, str] = dict(provenance or {})
+        self._segments: dict[str, IndexArray] = {}
+        self._blocks: dict[str, IndexArray] = {}
+
+    # -- to be supplied by each format -------------------------------------------------------------------
+
+    @abstractmethod
+    def _load_segments(self, receiver_id: str) -> IndexArray:
+        """Return (segment, 2) rows [start index, count], sorted, not overlapping, as the file stores them."""
+
+    @abstractmethod
+    def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
+        """Fill ``out`` (sample, 2) with one segment's samples from its ``skip``-th on."""
+
+    def close(self) -> None:  # noqa: B027  (a format that holds nothing open has nothing to do)
+        """Release the files. The recording cannot be read afterwards."""
+
+    # -- what callers use --------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {str(self.path)!r}, {len(self.receiver_ids)} receivers>"
+
+    @property
+    def fill_value(self) -> float:
+        """What I and Q both hold where the file has room for a sample that was never written; see `count_fill`."""
+        return FILL_VALUE[self.sample_format]
+
+    @property
+    def component_dtype(self) -> np.dtype[Any]:
+        """Type of one I or Q component as `read` returns it."""
+        return COMPONENT_DTYPE[self.sample_format]
+
+    def blocks(self, receiver_id: str) -> IndexArray:
+        """Return the stretches that a receiver recorded without a gap.
+
+        Returns
+        -------
+        (block, 2)
+            Rows [start index since the Unix epoch, count], ascending, with at least one lost sample between.
+
+        Raises
+        ------
+        InvalidInputError
+            The recording has no such receiver.
+        RecordingError
+            The file is damaged.
+        """
+        if receiver_id not in self._blocks:
+            self._blocks[receiver_id] = read_only(_merge(self._segments_of(receiver_id)))
+        return self._blocks[receiver_id]
+
+    def covers(self, receiver_id: str, start_index: int, count: int) -> bool:
+        """Tell whether a receiver recorded all of ``count`` samples from ``start_index`` on."""
+        return self._recorded_from(receiver_id, start_index) >= count
+
+    def read(self, receiver_id: str, start_index: int, count: int, out: IqArray | None = None) -> IqArray:
+        """Read samples by absolute index.
+
+        Parameters
+        ----------
+        receiver_id
+            One of `receiver_ids`.
+        start_index
+            First sample, counted from the Unix epoch.
+        count
+            Number of samples.
+        out : (sample, 2)
+            Buffer to fill: C-contiguous, at least ``count`` rows, of `component_dtype`. Reading into the same
+            buffer again and again is several times faster than taking a new one each time.
+
+        Returns
+        -------
+        (sample, 2)
+            I and Q; the first ``count`` rows of ``out`` when it was given.
+
+        Raises
+        ------
+        GapError
+            A sample in the range was not recorded.
+        InvalidInputError
+            No such receiver, ``count`` below one, or an unsuitable ``out``.
+        RecordingError
+            The file is damaged.
+        """
+        if count < 1:
+            raise InvalidInputError(f"`count` must be one or more, got {count}")
+        target = self._buffer(count, out)
+        recorded = self._recorded_from(receiver_id, start_index)
+        if recorded < count:
+            raise GapError(
+                f"{self.path}: receiver `{receiver_id}` did not record sample {start_index + recorded} of the "
+                f"{count} from {start_index} on; ask `covers` first and leave such a frame out"
+            )
+        segments = self._segments_of(receiver_id)
+        i = int(np.searchsorted(segments[:, 0], start_index, side="right")) - 1
+        done = 0
+        while done < count:
+            skip = start_index + done - int(segments[i, 0])
+            take = min(count - done, int(segments[i, 1]) - skip)
+            self._read_segment(receiver_id, i, skip, target[done : done + take])
+            done += take
+            i += 1
+        return target
+
+    # -- helpers -----------------------------------------------------------------------------------------
+
+    def _segments_of(self, receiver_id: str) -> IndexArray:
+        if receiver_id not in self.receiver_ids:
+            names = ", ".join(self.receiver_ids[:8]) + (", …" if len(self.receiver_ids) > 8 else "")
+            raise InvalidInputError(f"`receiver_id` must be one of {names}; got {receiver_id!r} for {self.path}")
+        if receiver_id not in self._segments:
+            self._segments[receiver_id] = self._load_segments(receiver_id)
+        return self._segments[receiver_id]
+
+    def _recorded_from(self, receiver_id: str, start_index: int) -> int:
+        """Count the samples recorded without a gap from ``start_index`` on; zero if that one is missing."""
+        blocks = self.blocks(receiver_id)
+        i = int(np.searchsorted(blocks[:, 0], start_index, side="right")) - 1
+        if i < 0:
+            return 0
+        return max(0, int(blocks[i, 0]) + int(blocks[i, 1]) - start_index)
+
+    def _buffer(self, count: int, out: IqArray | None) -> IqArray:
+        dtype = self.component_dtype
+        if out is None:
+            return np.empty((count, 2), dtype)
+        if out.dtype != dtype or out.ndim != 2 or out.shape[1] != 2 or out.shape[0] < count:
+            raise InvalidInputError(
+                f"`out` must be {dtype.name} of shape ({count} or more, 2), got {out.dtype} of shape {out.shape}"
+            )
+        if not (out.flags.c_contiguous and out.flags.writeable):
+            raise InvalidInputError("`out` must be C-contiguous and writeable")
+        return out[:count]
+
+
+def recorded_runs(recording: Recording) -> IndexArray:
+    """Return the stretches in which at least one receiver recorded: (run, 2) rows [start index, count]."""
+    rows = np.concatenate([recording.blocks(name) for name in recording.receiver_ids])
+    return _merge(rows[np.argsort(rows[:, 0], kind="stable")])
+
+
+def frame_starts(recording: Recording, frame_samples: int) -> IndexArray:
+    """Lay one grid of frames over a recording, the same for all receivers.
+
+    Frames lie back to back from the start of each stretch in which at least one receiver recorded. What is
+    left at the end of a stretch is shorter than a frame and not used. A receiver that misses part of a frame
+    is found with `Recording.covers`.
+
+    Parameters
+    ----------
+    recording
+        An open recording.
+    frame_samples
+        Samples in a frame, one or more.
+
+    Returns
+    -------
+    (frame,)
+        Index of each frame's first sample, ascending.
+
+    Raises
+    ------
+    InvalidInputError
+        ``frame_samples`` is below one.
+    """
+    if frame_samples < 1:
+        raise InvalidInputError(f"`frame_samples` must be one or more, got {frame_samples}")
+    runs = recorded_runs(recording)
+    n_frame, left_over = np.divmod(runs[:, 1], frame_samples)
+    if left_over.any():
+        _log.info(
+            "%s: %d samples at the end of %d of %d stretches are shorter than a frame of %d and are not used",
+            recording.path, left_over.sum(), np.count_nonzero(left_over), len(runs), frame_samples,
+        )  # fmt: skip
+    first_frame = np.repeat(np.cumsum(n_frame) - n_frame, n_frame)
+    within_run = np.arange(n_frame.sum(), dtype=np.int64) - first_frame
+    starts: IndexArray = np.repeat(runs[:, 0], n_frame) + within_run * frame_samples
+    return starts
+
+
+def _merge(rows: IndexArray) -> IndexArray:
+    """Join rows [start, count], sorted by start, that touch or overlap."""
+    if len(rows) == 0:
+        return np.empty((0, 2), np.int64)
+    start = rows[:, 0]
+    reached = np.maximum.accumulate(start + rows[:, 1])
+    opens = np.concatenate([[True], start[1:] > reached[:-1]])
+    closes = np.concatenate([opens[1:], [True]])
+    return np.stack([start[opens], reached[closes] - start[opens]], axis=1)

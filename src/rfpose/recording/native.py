@@ -1,0 +1,283 @@
+"""Reader of rfpose-iq, the project's own HDF5 layout; see ``docs/recording-format.md``."""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final, cast
+
+import h5py
+import numpy as np
+
+from rfpose.errors import RecordingError
+from rfpose.recording import keys
+from rfpose.recording.base import COMPOUND_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_compound
+from rfpose.scenario import Scenario, parse_scenario
+from rfpose.truth import Truth
+
+__all__ = ["NativeRecording"]
+
+_REMEDY = "the file is damaged or was not written by rfpose: make it again with `rfpose convert` or `rfpose simulate`"
+_TRUTH_IDS: Final = ("heliostat_ids", "receiver_ids", "transmitter_ids")
+_TRUTH_DIMENSIONS: Final = {
+    "normal_enu": 3,
+    "receiver_enu_m": 3,
+    "frame_start_index": 1,
+    "transmitter_phase_rad": 3,
+    "clock_ppm": 1,
+    "receiver_delay_s": 2,
+    "tone_snr": 4,
+}
+
+
+class NativeRecording(Recording):
+    """An rfpose-iq file. Open it through `open_recording`."""
+
+    def __init__(self, path: Path, *, scenario: Scenario | None = None) -> None:
+        self._file = _open_hdf5(path)
+        try:
+            fields = _Fields(path, self._file)
+            fields.check_format()
+            sample_format = fields.text(keys.SAMPLE_FORMAT)
+            if sample_format not in COMPOUND_DTYPE:
+                raise fields.error(keys.SAMPLE_FORMAT, f"must be int16 or complex64, is {sample_format!r}")
+            numerator, denominator = fields.integer(keys.RATE_NUMERATOR), fields.integer(keys.RATE_DENOMINATOR)
+            if numerator < 1 or denominator < 1:
+                raise fields.error(keys.RATE_NUMERATOR, f"gives a rate of {numerator}/{denominator}")
+            receivers = fields.group(keys.RECEIVERS)
+            self._iq: dict[str, h5py.Dataset] = {}
+            super().__init__(
+                path,
+                format="rfpose-iq",
+                receiver_ids=tuple(receivers),
+                sample_rate=Fraction(numerator, denominator),
+                centre_frequency_hz=fields.optional_number(keys.CENTRE_FREQUENCY),
+                sample_format=cast(SampleFormat, sample_format),
+                full_scale=fields.number(keys.FULL_SCALE),
+                scenario=scenario if scenario is not None else fields.scenario(),
+                truth=fields.truth(),
+                provenance=fields.provenance(),
+            )
+            if not self.receiver_ids:
+                raise RecordingError(f"{path}: `/{keys.RECEIVERS}` holds no receiver; {_REMEDY}")
+            for receiver_id in self.receiver_ids:
+                self._iq[receiver_id] = fields.iq(receiver_id, COMPOUND_DTYPE[sample_format])
+            self._fields = fields
+            self._offsets: dict[str, IndexArray] = {}
+        except BaseException:
+            self._file.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _load_segments(self, receiver_id: str) -> IndexArray:
+        rows = self._fields.blocks(receiver_id, len(self._iq[receiver_id]))
+        self._offsets[receiver_id] = rows[:, 2]
+        return rows[:, :2]
+
+    def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
+        first = int(self._offsets[receiver_id][i_segment]) + skip
+        target = as_compound(out, self.sample_format)
+        try:
+            # the buffer has the file's own compound type, so HDF5 copies bytes and converts nothing
+            self._iq[receiver_id].read_direct(target, np.s_[first : first + len(target)])
+        except (OSError, ValueError, RuntimeError) as error:
+            raise RecordingError(
+                f"{self.path}: cannot read `/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}` at {first}: {error}; copy the "
+                "file again or check the disk"
+            ) from error
+
+
+def _open_hdf5(path: Path) -> h5py.File:
+    try:
+        if path.stat().st_size == 0:
+            raise RecordingError(f"{path}: the file is empty; record or simulate again")
+        if not h5py.is_hdf5(path):
+            with path.open("rb"):  # says so when it is permission that lacks
+                pass
+            raise RecordingError(
+                f"{path}: not an HDF5 file; give an rfpose-iq file, a Digital RF directory or a SigMF recording"
+            )
+        # no chunk cache: each sample is read once, straight into the caller's buffer
+        return h5py.File(path, "r", rdcc_nbytes=0)
+    except RecordingError:
+        raise
+    except OSError as error:
+        if "truncated file" in str(error):
+            raise RecordingError(
+                f"{path}: the HDF5 file is truncated ({error}); copy it again, or record or simulate again"
+            ) from error
+        raise RecordingError(
+            f"{path}: cannot open: {error.strerror or error}; check the file and its rights"
+        ) from error
+
+
+class _Fields:
+    """Typed access to what is in the file; whatever is missing or mistyped is named."""
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self._path = path
+        self._file = file
+
+    def error(self, place: str, what: str) -> RecordingError:
+        """Build the error for an attribute of the root group."""
+        return RecordingError(f"{self._path}: attribute `{place}` {what}; {_REMEDY}")
+
+    # -- attributes of the root --------------------------------------------------------------------------
+
+    def check_format(self) -> None:
+        """Refuse another format's HDF5, and a version this program does not know."""
+        found = self._file.attrs.get(keys.FORMAT)
+        if found == keys.RESULT_FORMAT_NAME:
+            raise RecordingError(
+                f"{self._path}: this is a result of `rfpose process`, not a recording; use `rfpose evaluate` or "
+                "`rfpose info` on it, or give the recording it came from"
+            )
+        if found != keys.FORMAT_NAME:
+            if "rf_data" in self._file or "digital_rf_version" in self._file.attrs:
+                raise RecordingError(
+                    f"{self._path}: this is one file of a Digital RF recording; give the directory above its channels"
+                )
+            raise RecordingError(
+                f"{self._path}: an HDF5 file of another format (attribute `{keys.FORMAT}` of `/` must be "
+                f"{keys.FORMAT_NAME!r}, is {found!r}); give an rfpose-iq file or convert it with `rfpose convert`"
+            )
+        version = self.integer(keys.VERSION)
+        if version != keys.FORMAT_VERSION:
+            raise RecordingError(
+                f"{self._path}: {keys.FORMAT_NAME} version {version}; this program reads version "
+                f"{keys.FORMAT_VERSION}: install a newer rfpose"
+            )
+
+    def _attribute(self, name: str) -> Any:
+        if name not in self._file.attrs:
+            raise self.error(name, "of `/` is missing")
+        return self._file.attrs[name]
+
+    def text(self, name: str) -> str:
+        value = self._attribute(name)
+        if not isinstance(value, str):
+            raise self.error(name, f"of `/` must be text, is {value!r:.60}")
+        return value
+
+    def integer(self, name: str) -> int:
+        value = self._attribute(name)
+        if not isinstance(value, int | np.integer):
+            raise self.error(name, f"of `/` must be an integer, is {value!r:.60}")
+        return int(value)
+
+    def number(self, name: str) -> float:
+        value = self._attribute(name)
+        if not isinstance(value, int | float | np.integer | np.floating) or np.isnan(value):
+            raise self.error(name, f"of `/` must be a number, is {value!r:.60}")
+        return float(value)
+
+    def optional_number(self, name: str) -> float | None:
+        return self.number(name) if name in self._file.attrs else None
+
+    # -- groups and datasets -----------------------------------------------------------------------------
+
+    def _missing(self, place: str, wanted: str) -> RecordingError:
+        return RecordingError(f"{self._path}: `{place}` must be {wanted} and is missing or something else; {_REMEDY}")
+
+    def group(self, name: str) -> h5py.Group:
+        item = self._file.get(name)
+        if not isinstance(item, h5py.Group):
+            raise self._missing(f"/{name}", "a group")
+        return item
+
+    def _dataset(self, place: str, wanted: str) -> h5py.Dataset:
+        item = self._file.get(place)
+        if not isinstance(item, h5py.Dataset):
+            raise self._missing(place, wanted)
+        return item
+
+    def iq(self, receiver_id: str, dtype: np.dtype[Any]) -> h5py.Dataset:
+        """Return a receiver's samples, of exactly the promised type."""
+        place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}"
+        dataset = self._dataset(place, "a dataset of samples")
+        if dataset.ndim != 1 or dataset.dtype != dtype:
+            raise RecordingError(
+                f"{self._path}: `{place}` must be one-dimensional of type {dtype}, is {dataset.ndim}-dimensional of "
+                f"type {dataset.dtype}; {_REMEDY}"
+            )
+        return dataset
+
+    def blocks(self, receiver_id: str, n_stored: int) -> IndexArray:
+        """Return (block, 3) rows [start index, count, offset in iq], checked."""
+        place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
+        dataset = self._dataset(place, "a table of int64")
+        if dataset.ndim != 2 or dataset.shape[1] != 3 or dataset.dtype != np.dtype("<i8"):
+            raise RecordingError(
+                f"{self._path}: `{place}` must be int64 of shape (block, 3), is {dataset.dtype} of shape "
+                f"{dataset.shape}; {_REMEDY}"
+            )
+        rows: IndexArray = dataset[()]
+        start, count, offset = rows[:, 0], rows[:, 1], rows[:, 2]
+        # subtractions, not sums: numbers from a damaged file must not overflow into plausible ones
+        in_range = (start >= 0) & (start < 2**62) & (count > 0) & (offset >= 0) & (offset <= n_stored)
+        in_range &= count <= n_stored - np.clip(offset, 0, n_stored)
+        if not in_range.all():
+            i = int(np.flatnonzero(~in_range)[0])
+            raise RecordingError(
+                f"{self._path}: `{place}` row {i} is {rows[i].tolist()} [start, count, offset], which does not lie "
+                f"within the {n_stored} samples stored; {_REMEDY}"
+            )
+        if np.any(start[1:] < start[:-1] + count[:-1]):
+            i = int(np.flatnonzero(start[1:] < start[:-1] + count[:-1])[0]) + 1
+            raise RecordingError(f"{self._path}: `{place}` row {i} starts before row {i - 1} ends; {_REMEDY}")
+        return rows
+
+    def scenario(self) -> Scenario | None:
+        """Return the embedded scenario."""
+        if keys.SCENARIO not in self._file:
+            return None
+        return parse_scenario(self._text_dataset(f"/{keys.SCENARIO}"), source=f"{self._path}:/{keys.SCENARIO}")
+
+    def _text_dataset(self, place: str) -> str:
+        dataset = self._dataset(place, "a text")
+        if dataset.shape != () or h5py.check_string_dtype(dataset.dtype) is None:
+            raise self._missing(place, "a text")
+        try:
+            return str(dataset.asstr()[()])
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{self._path}: `{place}` is not UTF-8; {_REMEDY}") from error
+
+    def provenance(self) -> dict[str, str]:
+        """Return the provenance and the writing program."""
+        found = {keys.CREATED_BY: self.text(keys.CREATED_BY)}
+        if keys.PROVENANCE in self._file:
+            for name, value in self.group(keys.PROVENANCE).attrs.items():
+                found[str(name)] = str(value)
+        return found
+
+    def truth(self) -> Truth | None:
+        """Return what was simulated, if the file says."""
+        if keys.TRUTH not in self._file:
+            return None
+        group = self.group(keys.TRUTH)
+        found: dict[str, Any] = {name: self._ids(name) for name in _TRUTH_IDS}
+        required = {field.name for field in dataclasses.fields(Truth) if field.default is dataclasses.MISSING}
+        for name, n_dimension in _TRUTH_DIMENSIONS.items():
+            if name not in group and name not in required:
+                continue
+            place = f"/{keys.TRUTH}/{name}"
+            dtype = np.dtype("<i8") if name == "frame_start_index" else np.dtype("<f8")
+            dataset = self._dataset(place, f"a dataset of {dtype}")
+            if dataset.dtype != dtype or dataset.ndim != n_dimension:
+                raise RecordingError(
+                    f"{self._path}: `{place}` must be {dtype} of {n_dimension} dimensions, is {dataset.dtype} of "
+                    f"shape {dataset.shape}; {_REMEDY}"
+                )
+            found[name] = dataset[()]
+        return Truth(**found)
+
+    def _ids(self, name: str) -> tuple[str, ...]:
+        place = f"/{keys.TRUTH}/{name}"
+        dataset = self._dataset(place, "a list of texts")
+        if dataset.ndim != 1 or h5py.check_string_dtype(dataset.dtype) is None:
+            raise self._missing(place, "a list of texts")
+        return tuple(str(item) for item in dataset.asstr()[()])

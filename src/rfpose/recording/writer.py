@@ -1,0 +1,295 @@
+"""Writer of rfpose-iq; see ``docs/recording-format.md``."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Self, get_args
+
+import h5py
+import numpy as np
+
+from rfpose import __version__
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.recording import keys
+from rfpose.recording.base import (
+    COMPONENT_DTYPE,
+    COMPOUND_DTYPE,
+    FILL_VALUE,
+    IqArray,
+    SampleFormat,
+    as_compound,
+)
+from rfpose.scenario import Scenario
+from rfpose.truth import Truth
+
+__all__ = ["RecordingWriter", "refuse_existing", "temporary_beside"]
+
+_CHUNK_BYTES = 2**20
+_SMALLEST_CHUNK_SAMPLES = 2**14
+_CACHE_BYTES = 2**26
+"""Chunks that are being filled, over all receivers together."""
+_RECEIVER_ID = re.compile(r"[A-Za-z0-9_.\-]+")
+
+
+class RecordingWriter:
+    """Write an rfpose-iq file, as a context manager.
+
+    The file grows under a temporary name beside ``path`` and takes its name when the block ends without an
+    exception. Otherwise it is removed, and whatever was at ``path`` stays as it was. Nothing that depends on
+    the time of writing goes into it: equal input gives equal bytes.
+
+    Parameters
+    ----------
+    path
+        File to make.
+    scenario
+        The site, embedded as text; None when it is not known.
+    receiver_ids
+        Receivers, in the order in which readers will see them.
+    sample_rate
+        Exact rate [1/s].
+    centre_frequency_hz
+        Radio frequency at baseband zero [Hz]; None when it is not known.
+    sample_format
+        ``"int16"`` or ``"complex64"``.
+    full_scale
+        Largest magnitude that I or Q can take (32767 for a 16-bit digitiser); infinite when there is no limit.
+    provenance
+        How the samples came about, text by name.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    InvalidInputError
+        An argument makes no sense.
+    RecordingError
+        The file exists already, or cannot be written (disk full, no rights).
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        scenario: Scenario | None,
+        receiver_ids: Sequence[str],
+        sample_rate: Fraction,
+        centre_frequency_hz: float | None,
+        sample_format: SampleFormat,
+        full_scale: float,
+        provenance: Mapping[str, str],
+        overwrite: bool = False,
+    ) -> None:
+        if sample_format not in get_args(SampleFormat):
+            raise InvalidInputError(f"`sample_format` must be int16 or complex64, got {sample_format!r}")
+        if sample_rate <= 0:
+            raise InvalidInputError(f"`sample_rate` must be greater than zero, got {sample_rate}")
+        if not full_scale > 0:
+            raise InvalidInputError(f"`full_scale` must be greater than zero, got {full_scale}")
+        if not receiver_ids or len(set(receiver_ids)) != len(receiver_ids):
+            raise InvalidInputError("`receiver_ids` must name at least one receiver, and none twice")
+        for receiver_id in receiver_ids:
+            if not _RECEIVER_ID.fullmatch(receiver_id) or receiver_id in (".", ".."):
+                raise InvalidInputError(
+                    f"`receiver_ids` may hold letters, digits, `_`, `-` and `.`, got {receiver_id!r}"
+                )
+        self.path = Path(path)
+        refuse_existing(self.path, overwrite=overwrite)
+        self._overwrite = overwrite
+        self._scenario = scenario
+        self._receiver_ids = tuple(receiver_ids)
+        self._sample_rate = Fraction(sample_rate)
+        self._centre_frequency_hz = centre_frequency_hz
+        self._sample_format: SampleFormat = sample_format
+        self._full_scale = float(full_scale)
+        self._provenance = dict(provenance)
+        self._temporary = temporary_beside(self.path)
+        self._file: h5py.File | None = None
+        self._iq: dict[str, h5py.Dataset] = {}
+        self._blocks: dict[str, list[list[int]]] = {name: [] for name in self._receiver_ids}
+        self._stored = dict.fromkeys(self._receiver_ids, 0)
+
+    def __enter__(self) -> Self:
+        try:
+            with self._write_errors():
+                self._create()
+        except BaseException:
+            self._discard()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                with self._write_errors():
+                    self._finish()
+        finally:
+            self._discard()
+
+    def write(self, receiver_id: str, start_index: int, samples: IqArray) -> None:
+        """Append samples of one receiver.
+
+        Parameters
+        ----------
+        receiver_id
+            One of those given at the start.
+        start_index
+            Index of the first sample since the Unix epoch. Where it lies beyond the end of what was written
+            last, the samples between are recorded as lost; it may not lie before.
+        samples : (sample, 2)
+            I and Q: int16 counts, or float32 for ``"complex64"``.
+
+        Raises
+        ------
+        InvalidInputError
+            No such receiver, wrong shape or type, or a step back in time.
+        RecordingError
+            Disk full, or another failure to write.
+        """
+        if receiver_id not in self._blocks:
+            raise InvalidInputError(
+                f"`receiver_id` must be one of {', '.join(self._receiver_ids)}; got {receiver_id!r}"
+            )
+        dtype = COMPONENT_DTYPE[self._sample_format]
+        if samples.ndim != 2 or samples.shape[1] != 2 or samples.dtype != dtype:
+            raise InvalidInputError(
+                f"`samples` must be {dtype.name} of shape (sample, 2), got {samples.dtype} of shape {samples.shape}"
+            )
+        blocks = self._blocks[receiver_id]
+        reached = blocks[-1][0] + blocks[-1][1] if blocks else 0
+        if start_index < reached:
+            raise InvalidInputError(
+                f"`start_index` must not go back: receiver `{receiver_id}` is written up to {reached}, got {start_index}"
+            )
+        if len(samples) == 0:
+            return
+        dataset = self._dataset(receiver_id)
+        offset = self._stored[receiver_id]
+        with self._write_errors():
+            dataset.resize((offset + len(samples),))
+            dataset.write_direct(
+                as_compound(np.ascontiguousarray(samples), self._sample_format),
+                dest_sel=np.s_[offset : offset + len(samples)],
+            )
+        if blocks and start_index == reached:
+            blocks[-1][1] += len(samples)
+        else:
+            blocks.append([int(start_index), len(samples), offset])
+        self._stored[receiver_id] = offset + len(samples)
+
+    def write_truth(self, truth: Truth) -> None:
+        """Write what was simulated; once."""
+        file = self._open_file()
+        with self._write_errors():
+            group = file.create_group(keys.TRUTH)
+            for field in dataclasses.fields(truth):
+                value = getattr(truth, field.name)
+                if field.name.endswith("_ids"):
+                    group.create_dataset(field.name, data=list(value), dtype=h5py.string_dtype(), shape=(len(value),))
+                elif value is not None:
+                    group.create_dataset(field.name, data=value)
+
+    # -- the file ----------------------------------------------------------------------------------------
+
+    def _create(self) -> None:
+        cache = _CACHE_BYTES // len(self._receiver_ids)
+        self._file = file = h5py.File(self._temporary, "w", rdcc_nbytes=cache)
+        attrs = file.attrs
+        attrs[keys.FORMAT] = keys.FORMAT_NAME
+        attrs[keys.VERSION] = np.int64(keys.FORMAT_VERSION)
+        attrs[keys.RATE_NUMERATOR] = np.int64(self._sample_rate.numerator)
+        attrs[keys.RATE_DENOMINATOR] = np.int64(self._sample_rate.denominator)
+        if self._centre_frequency_hz is not None:
+            attrs[keys.CENTRE_FREQUENCY] = float(self._centre_frequency_hz)
+        attrs[keys.SAMPLE_FORMAT] = self._sample_format
+        attrs[keys.FULL_SCALE] = self._full_scale
+        attrs[keys.CREATED_BY] = f"rfpose {__version__}"
+        provenance = file.create_group(keys.PROVENANCE)
+        for name in sorted(self._provenance):
+            provenance.attrs[name] = self._provenance[name]
+        if self._scenario is not None:
+            file.create_dataset(keys.SCENARIO, data=self._scenario.to_toml(), dtype=h5py.string_dtype())
+        dtype = COMPOUND_DTYPE[self._sample_format]
+        fill = np.array((FILL_VALUE[self._sample_format],) * 2, dtype)
+        receivers = file.create_group(keys.RECEIVERS, track_order=True)
+        for receiver_id in self._receiver_ids:
+            self._iq[receiver_id] = receivers.create_group(receiver_id).create_dataset(
+                keys.IQ, shape=(0,), maxshape=(None,), chunks=(self._chunk_samples(),), dtype=dtype, fillvalue=fill
+            )
+
+    def _chunk_samples(self) -> int:
+        """Return chunks of up to 1 MiB of which a whole number makes a frame, so that a frame reads and writes whole."""
+        largest = _CHUNK_BYTES // COMPOUND_DTYPE[self._sample_format].itemsize
+        if self._scenario is None:
+            return largest
+        frame = self._scenario.radio.frame_samples
+        if frame < _SMALLEST_CHUNK_SAMPLES:
+            return frame * math.ceil(_SMALLEST_CHUNK_SAMPLES / frame)
+        return math.ceil(frame / math.ceil(frame / largest))
+
+    def _finish(self) -> None:
+        file = self._open_file()
+        for receiver_id, blocks in self._blocks.items():
+            table = np.array(blocks, np.int64).reshape(-1, 3)
+            file[keys.RECEIVERS][receiver_id].create_dataset(keys.BLOCKS, data=table)
+        self._iq.clear()
+        file.close()
+        self._file = None
+        with self._temporary.open("rb") as done:
+            os.fsync(done.fileno())  # a disk that fills late says so here, before the name is taken
+        refuse_existing(self.path, overwrite=self._overwrite)
+        self._temporary.replace(self.path)
+
+    def _discard(self) -> None:
+        """Remove the temporary file; after a success there is none."""
+        self._iq.clear()
+        if self._file is not None:
+            with contextlib.suppress(OSError, RuntimeError, ValueError):  # the first error is the one to report
+                self._file.close()
+            self._file = None
+        self._temporary.unlink(missing_ok=True)
+
+    def _open_file(self) -> h5py.File:
+        if self._file is None:
+            raise InvalidInputError(f"the writer of {self.path} is not open: use it in a `with` statement")
+        return self._file
+
+    def _dataset(self, receiver_id: str) -> h5py.Dataset:
+        self._open_file()
+        return self._iq[receiver_id]
+
+    @contextlib.contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except RecordingError:
+            raise
+        except (OSError, RuntimeError) as error:  # HDF5 reports a full disk at close as a RuntimeError
+            reason = str(error).splitlines()[0]
+            raise RecordingError(
+                f"{self.path}: cannot write the recording: {reason}; free space on the disk, check that the directory "
+                "exists and may be written, or write elsewhere"
+            ) from error
+
+
+def refuse_existing(path: Path, *, overwrite: bool) -> None:
+    """Raise unless ``path`` is free or may be replaced."""
+    if path.is_dir():
+        raise RecordingError(f"{path}: is a directory; give the name of a file")
+    if path.exists() and not overwrite:
+        raise RecordingError(f"{path}: exists already; choose another name or add `--force` to replace it")
+
+
+def temporary_beside(path: Path) -> Path:
+    """Return the name under which ``path`` is made before it takes its own."""
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
