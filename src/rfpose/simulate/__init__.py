@@ -1,1 +1,5 @@
 """Synthetic recordings, from a time-domain sum of rays."""
+
+from rfpose.simulate.simulator import Chunk, Simulator
+
+__all__ = ["Chunk", "Simulator"]
