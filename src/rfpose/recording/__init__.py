@@ -4,14 +4,19 @@
 """
 
 from rfpose.recording.base import GapError, Recording, count_fill, frame_starts, recorded_runs
+from rfpose.recording.conversion import convert
 from rfpose.recording.opening import open_recording
+from rfpose.recording.summary import check_against, describe
 from rfpose.recording.writer import RecordingWriter
 
 __all__ = [
     "GapError",
     "Recording",
     "RecordingWriter",
+    "check_against",
+    "convert",
     "count_fill",
+    "describe",
     "frame_starts",
     "open_recording",
     "recorded_runs",

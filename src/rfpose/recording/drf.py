@@ -53,8 +53,13 @@ class DigitalRfRecording(Recording):
             self._reader = library.DigitalRFReader(str(path))
             properties = {name: self._reader.get_properties(name) for name in self._reader.get_channels()}
         first = next(iter(properties))
+        sample_format = self._checked_format(first, properties[first])
         for name, found in properties.items():
-            self._check_channel(name, found, first, properties[first])
+            if self._checked_format(name, found) != sample_format or _rate(found) != _rate(properties[first]):
+                raise RecordingError(
+                    f"{path}: channel `{name}` ({_rate(found)} Hz) and channel `{first}` ({sample_format} at "
+                    f"{_rate(properties[first])} Hz) differ in rate or type; put them into separate directories"
+                )
         self._place: dict[str, tuple[str, int]] = {}
         for name, found in properties.items():
             n_subchannel = int(found["num_subchannels"])
@@ -66,8 +71,6 @@ class DigitalRfRecording(Recording):
                         "under the same name; rename one of the directories"
                     )
                 self._place[receiver_id] = (name, k)
-        sample_format = _sample_format(properties[first])
-        assert sample_format is not None  # _check_channel saw to it
         super().__init__(
             path,
             format="digital-rf",
@@ -87,19 +90,16 @@ class DigitalRfRecording(Recording):
         """Release the library's open file."""
         self._reader.close()
 
-    def _check_channel(self, name: str, found: dict[str, Any], first: str, reference: dict[str, Any]) -> None:
-        if not int(found["is_complex"]) or _sample_format(found) is None:
-            kind = {0: "integer", 1: "float"}.get(int(found["H5Tget_class"]), "unknown")
+    def _checked_format(self, channel: str, found: dict[str, Any]) -> SampleFormat:
+        kind, size, is_complex = int(found["H5Tget_class"]), int(found["H5Tget_size"]), bool(found["is_complex"])
+        sample_format = _SAMPLE_FORMATS.get((kind, size))
+        if sample_format is None or not is_complex:
             raise RecordingError(
-                f"{self._path}: channel `{name}` holds {'complex' if int(found['is_complex']) else 'real'} samples of "
-                f"{kind} type, {8 * int(found['H5Tget_size'])} bits; rfpose reads complex int16 and complex float32: "
-                "record or convert it to one of them"
+                f"{self._path}: channel `{channel}` holds {'complex' if is_complex else 'real'} samples of {8 * size} "
+                f"bits ({ {0: 'integer', 1: 'float'}.get(kind, 'other') }); rfpose reads complex int16 and complex "
+                "float32: record or convert it to one of them"
             )
-        if _rate(found) != _rate(reference) or _sample_format(found) != _sample_format(reference):
-            raise RecordingError(
-                f"{self._path}: channel `{name}` ({_sample_format(found)} at {_rate(found)} Hz) and channel `{first}` "
-                f"({_sample_format(reference)} at {_rate(reference)} Hz) differ; put them into separate directories"
-            )
+        return sample_format
 
     def _centre_frequency(self, channel: str) -> float | None:
         try:
@@ -155,7 +155,3 @@ class DigitalRfRecording(Recording):
 
 def _rate(properties: dict[str, Any]) -> Fraction:
     return Fraction(int(properties["sample_rate_numerator"]), int(properties["sample_rate_denominator"]))
-
-
-def _sample_format(properties: dict[str, Any]) -> SampleFormat | None:
-    return _SAMPLE_FORMATS.get((int(properties["H5Tget_class"]), int(properties["H5Tget_size"])))

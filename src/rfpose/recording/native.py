@@ -10,7 +10,7 @@ from typing import Any, Final, cast
 import h5py
 import numpy as np
 
-from rfpose.errors import RecordingError
+from rfpose.errors import RecordingError, RfposeError
 from rfpose.recording import keys
 from rfpose.recording.base import COMPOUND_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_compound
 from rfpose.scenario import Scenario, parse_scenario
@@ -65,8 +65,10 @@ class NativeRecording(Recording):
                 self._iq[receiver_id] = fields.iq(receiver_id, COMPOUND_DTYPE[sample_format])
             self._fields = fields
             self._offsets: dict[str, IndexArray] = {}
-        except BaseException:
+        except BaseException as error:
             self._file.close()
+            if isinstance(error, OSError | RuntimeError | KeyError | ValueError) and not isinstance(error, RfposeError):
+                raise RecordingError(f"{path}: damaged HDF5 file: {error}; copy it again") from error
             raise
 
     def close(self) -> None:
@@ -131,6 +133,7 @@ class _Fields:
     def check_format(self) -> None:
         """Refuse another format's HDF5, and a version this program does not know."""
         found = self._file.attrs.get(keys.FORMAT)
+        found = found if isinstance(found, str) else None
         if found == keys.RESULT_FORMAT_NAME:
             raise RecordingError(
                 f"{self._path}: this is a result of `rfpose process`, not a recording; use `rfpose evaluate` or "

@@ -169,7 +169,7 @@ class RecordingWriter:
         reached = blocks[-1][0] + blocks[-1][1] if blocks else 0
         if start_index < reached:
             raise InvalidInputError(
-                f"`start_index` must not go back: receiver `{receiver_id}` is written up to {reached}, got {start_index}"
+                f"`start_index` must not go back: `{receiver_id}` is written up to {reached}, got {start_index}"
             )
         if len(samples) == 0:
             return
@@ -228,7 +228,7 @@ class RecordingWriter:
             )
 
     def _chunk_samples(self) -> int:
-        """Return chunks of up to 1 MiB of which a whole number makes a frame, so that a frame reads and writes whole."""
+        """Return the length of a chunk: up to 1 MiB, and a whole number of them a frame, so that frames align."""
         largest = _CHUNK_BYTES // COMPOUND_DTYPE[self._sample_format].itemsize
         if self._scenario is None:
             return largest

@@ -1,0 +1,277 @@
+"""From one recording format to another, streamed."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from rfpose import __version__
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.recording.base import IqArray, Recording, RecordingFormat
+from rfpose.recording.drf import CENTRE_FREQUENCIES, import_digital_rf
+from rfpose.recording.opening import open_recording
+from rfpose.recording.sidecar import SCENARIO_FILE
+from rfpose.recording.sigmf_files import DATATYPES, META_SUFFIX, import_sigmf
+from rfpose.recording.writer import RecordingWriter, temporary_beside
+
+__all__ = ["convert"]
+
+_log = logging.getLogger(__name__)
+
+_PIECE_SAMPLES = 2**20
+_SUBDIRECTORY_SECONDS = 3600
+_FILE_MILLISECONDS = 1000
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def convert(
+    source: Recording,
+    target_path: str | Path,
+    *,
+    format: RecordingFormat,
+    overwrite: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a recording in another format.
+
+    Samples, their times and gaps, rate and tuning are kept exactly. rfpose-iq keeps scenario, truth and
+    provenance too; the other two get the scenario as a file ``scenario.toml`` beside the receivers, where
+    `open_recording` finds it, and have no place for truth and full scale.
+
+    Parameters
+    ----------
+    source
+        An open recording.
+    target_path
+        File (rfpose-iq) or directory (the others) to make.
+    format
+        ``"rfpose-iq"``, ``"digital-rf"`` or ``"sigmf"``.
+    overwrite
+        Replace an existing recording. A directory that is not a recording is never replaced.
+    on_progress
+        Called with samples done and samples in all, over all receivers.
+
+    Raises
+    ------
+    InvalidInputError
+        Unknown ``format``.
+    RecordingError
+        The target exists, cannot be written, or the format's library is missing; the source is damaged.
+    """
+    if format not in get_args(RecordingFormat):
+        raise InvalidInputError(f"`format` must be one of {', '.join(get_args(RecordingFormat))}, got {format!r}")
+    target = Path(target_path)
+    if target.exists() and target.resolve() == source.path.resolve():
+        raise RecordingError(f"{target}: source and target are the same; choose another name")
+    if format == "rfpose-iq":
+        _to_native(source, target, overwrite, on_progress)
+        return
+    if source.truth is not None:
+        _log.warning("%s: %s has no place for the truth of a simulation; it is left out", target, format)
+    stream_writer = _DigitalRfStream if format == "digital-rf" else _SigmfStream
+    stream_writer.library()
+    with _new_directory(target, overwrite=overwrite) as directory:
+        _to_directory(source, directory, stream_writer, on_progress)
+
+
+def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -> Iterator[tuple[str, int, IqArray]]:
+    """Yield (receiver, start index, samples) of everything recorded, receiver by receiver; the buffer is reused."""
+    total = sum(int(source.blocks(name)[:, 1].sum()) for name in source.receiver_ids)
+    buffer = np.empty((_PIECE_SAMPLES, 2), source.component_dtype)
+    done = 0
+    for receiver_id in source.receiver_ids:
+        for start, count in source.blocks(receiver_id).tolist():
+            for at in range(start, start + count, _PIECE_SAMPLES):
+                take = min(_PIECE_SAMPLES, start + count - at)
+                yield receiver_id, at, source.read(receiver_id, at, take, out=buffer)
+                done += take
+                if on_progress is not None:
+                    on_progress(done, total)
+
+
+def _to_native(
+    source: Recording, target: Path, overwrite: bool, on_progress: Callable[[int, int], None] | None
+) -> None:
+    with RecordingWriter(
+        target,
+        scenario=source.scenario,
+        receiver_ids=source.receiver_ids,
+        sample_rate=source.sample_rate,
+        centre_frequency_hz=source.centre_frequency_hz,
+        sample_format=source.sample_format,
+        full_scale=source.full_scale,
+        provenance={**source.provenance, "converted_from": f"{source.format}: {source.path.name}"},
+        overwrite=overwrite,
+    ) as writer:
+        for receiver_id, start, samples in _pieces(source, on_progress):
+            writer.write(receiver_id, start, samples)
+        if source.truth is not None:
+            writer.write_truth(source.truth)
+
+
+# -- formats that are directories ----------------------------------------------------------------------------
+
+
+class _Stream(ABC):
+    """Writes one receiver of a directory format."""
+
+    def __init__(self, directory: Path, receiver_id: str, source: Recording) -> None:
+        self.directory = directory
+        self.receiver_id = receiver_id
+        self.source = source
+
+    @staticmethod
+    @abstractmethod
+    def library() -> Any:
+        """Return the format's library, or raise when it is not installed."""
+
+    @abstractmethod
+    def write(self, start_index: int, samples: IqArray) -> None:
+        """Append samples."""
+
+    @abstractmethod
+    def finish(self) -> None:
+        """Complete and close the files."""
+
+
+class _DigitalRfStream(_Stream):
+    library = staticmethod(import_digital_rf)
+
+    def __init__(self, directory: Path, receiver_id: str, source: Recording) -> None:
+        super().__init__(directory, receiver_id, source)
+        channel = directory / receiver_id
+        channel.mkdir()
+        rate = source.sample_rate
+        self._first = int(source.blocks(receiver_id)[0, 0])
+        self._writer = self.library().DigitalRFWriter(
+            str(channel),
+            np.dtype("<i2") if source.sample_format == "int16" else np.dtype("<c8"),
+            subdir_cadence_secs=_SUBDIRECTORY_SECONDS,
+            file_cadence_millisecs=_FILE_MILLISECONDS,
+            start_global_index=self._first,
+            sample_rate_numerator=rate.numerator,
+            sample_rate_denominator=rate.denominator,
+            uuid_str=receiver_id,
+            is_complex=True,
+            is_continuous=False,  # with gaps, rather than with fill values in them
+            marching_periods=False,
+        )
+        if source.centre_frequency_hz is not None:
+            metadata = channel / "metadata"
+            metadata.mkdir()
+            self.library().DigitalMetadataWriter(
+                str(metadata), _SUBDIRECTORY_SECONDS, 1, rate.numerator, rate.denominator, "metadata"
+            ).write(self._first, {CENTRE_FREQUENCIES: np.array([[source.centre_frequency_hz]])})
+
+    def write(self, start_index: int, samples: IqArray) -> None:
+        self._writer.rf_write(samples, start_index - self._first)
+
+    def finish(self) -> None:
+        self._writer.close()
+
+
+class _SigmfStream(_Stream):
+    library = staticmethod(import_sigmf)
+
+    def __init__(self, directory: Path, receiver_id: str, source: Recording) -> None:
+        super().__init__(directory, receiver_id, source)
+        self._data = directory / f"{receiver_id}.sigmf-data"
+
+    def write(self, start_index: int, samples: IqArray) -> None:
+        with self._data.open("ab") as file:
+            file.write(samples.data)
+
+    def finish(self) -> None:
+        meta = self.library().SigMFFile(
+            global_info={
+                "core:datatype": DATATYPES[self.source.sample_format],
+                "core:sample_rate": float(self.source.sample_rate),
+                "core:recorder": f"rfpose {__version__}",
+            },
+        )
+        offset = 0
+        for start, count in self.source.blocks(self.receiver_id).tolist():
+            capture = {"core:global_index": start, "core:datetime": _datetime_text(start, self.source.sample_rate)}
+            if self.source.centre_frequency_hz is not None:
+                capture["core:frequency"] = self.source.centre_frequency_hz
+            meta.add_capture(offset, metadata=capture)
+            offset += count
+        meta.tofile(str(self._data.with_suffix(META_SUFFIX)))
+
+
+def _datetime_text(index: int, rate: Fraction) -> str:
+    """Return the time of a sample in UTC, to the picosecond."""
+    picoseconds = round(index / rate * 10**12)
+    whole = _EPOCH + timedelta(seconds=picoseconds // 10**12)
+    return f"{whole:%Y-%m-%dT%H:%M:%S}.{picoseconds % 10**12:012d}Z"
+
+
+def _to_directory(
+    source: Recording,
+    directory: Path,
+    stream_writer: type[_Stream],
+    on_progress: Callable[[int, int], None] | None,
+) -> None:
+    stream: _Stream | None = None
+    for receiver_id, start, samples in _pieces(source, on_progress):
+        if stream is None or stream.receiver_id != receiver_id:
+            if stream is not None:
+                stream.finish()
+            stream = stream_writer(directory, receiver_id, source)
+        stream.write(start, samples)
+    if stream is None:
+        raise RecordingError(f"{source.path}: no samples to convert; check it with `rfpose info`")
+    stream.finish()
+    if source.scenario is not None:
+        (directory / SCENARIO_FILE).write_text(source.scenario.to_toml(), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _new_directory(target: Path, *, overwrite: bool) -> Iterator[Path]:
+    """Yield an empty directory that takes ``target``'s place when the block ends well, and is removed otherwise."""
+    if target.exists():
+        if not overwrite:
+            raise RecordingError(f"{target}: exists already; choose another name or add `--force` to replace it")
+        _refuse_if_not_recording(target)
+    temporary = temporary_beside(target)
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        yield temporary
+        replaced = target.with_name(f".{target.name}.{os.getpid()}.old")
+        if target.exists():
+            target.replace(replaced)
+        temporary.replace(target)
+        shutil.rmtree(replaced, ignore_errors=True)
+    except RecordingError:
+        raise
+    except (OSError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise RecordingError(
+            f"{target}: cannot write the recording: {reason}; free space on the disk, check that the directory above "
+            "exists and may be written, or write elsewhere"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _refuse_if_not_recording(target: Path) -> None:
+    """Raise unless ``target`` is a directory that holds a recording: nothing else is thrown away."""
+    if not target.is_dir():
+        raise RecordingError(f"{target}: is a file, and this format is a directory; choose another name")
+    try:
+        open_recording(target).close()
+    except RecordingError as error:
+        raise RecordingError(
+            f"{target}: a directory that is not a recording is never replaced; choose another name"
+        ) from error
