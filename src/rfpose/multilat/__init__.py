@@ -1,1 +1,26 @@
 """Range differences to receiver positions, and those to mirror normals."""
+
+from rfpose.multilat.bounds import dop, normal_bound, position_bound, tilt_rms_from_position
+from rfpose.multilat.fix import Fixes, FixStatus, locate
+from rfpose.multilat.normal import Normals, Poses, PoseStatus, joint_covariance, mirror_normal, solve_poses
+from rfpose.multilat.ranges import RangeDifferences, RangeStatus, check_unambiguous, range_differences
+
+__all__ = [
+    "FixStatus",
+    "Fixes",
+    "Normals",
+    "PoseStatus",
+    "Poses",
+    "RangeDifferences",
+    "RangeStatus",
+    "check_unambiguous",
+    "dop",
+    "joint_covariance",
+    "locate",
+    "mirror_normal",
+    "normal_bound",
+    "position_bound",
+    "range_differences",
+    "solve_poses",
+    "tilt_rms_from_position",
+]

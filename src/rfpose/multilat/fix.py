@@ -1,0 +1,315 @@
+"""From range differences to receiver positions: Gauss-Newton from a cold start, for many receivers at once."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2 as chi2_distribution
+
+from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.multilat import _kernels
+
+__all__ = ["FixStatus", "Fixes", "locate"]
+
+IntArray = npt.NDArray[np.int16]
+StatusArray = npt.NDArray[np.int8]
+
+# Steps below this many standard deviations end the iteration; what then remains is far smaller still.
+STEP_TOLERANCE_SIGMA = 1e-6
+# A cold start is taken again from elsewhere when its residuals are less likely than this.
+RESTART_PROBABILITY = 1e-3
+
+
+class FixStatus(IntEnum):
+    """What became of one receiver's fix; ``reason`` says it in words."""
+
+    OK = _kernels.OK
+    TOO_FEW = _kernels.TOO_FEW
+    NOT_FINITE = _kernels.NOT_FINITE
+    SINGULAR = _kernels.SINGULAR
+    NOT_CONVERGED = _kernels.NOT_CONVERGED
+    WEAK_GEOMETRY = 5
+    RESIDUAL = 6
+
+    @property
+    def reason(self) -> str:
+        """The status in words."""
+        return _REASON[self]
+
+
+_REASON = {
+    FixStatus.OK: "solved",
+    FixStatus.TOO_FEW: "too few transmitters received: three dimensions need five, two need four",
+    FixStatus.NOT_FINITE: "no transmitter received",
+    FixStatus.SINGULAR: "the transmitters received and the receiver lie in one plane or on one line",
+    FixStatus.NOT_CONVERGED: "the iteration did not converge from any start",
+    FixStatus.WEAK_GEOMETRY: "dilution of precision above the limit",
+    FixStatus.RESIDUAL: "residuals far above what the sigma of the ranges allows (a reflection, a blocked path?)",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fixes:
+    """Positions of receivers, one row a receiver, in the site ENU frame; arrays are read-only.
+
+    A row whose status is neither OK nor RESIDUAL is NaN. A RESIDUAL row keeps its numbers, as the best that
+    least squares can say; its covariance is not to be trusted. ``xyz`` is ``xy`` where two dimensions were
+    solved.
+
+    Attributes
+    ----------
+    position_enu_m : (receiver, xyz)
+        [m].
+    clock_m : (receiver,)
+        What the row's ranges lack to be true ranges: the range to the reference transmitter [m].
+    cov_enu_m2 : (receiver, xyz, xyz)
+        Covariance of the position for the given sigma, the clock estimated with it [m²].
+    dop : (receiver,)
+        Position dilution of precision: position RMS per unit of range sigma, all transmitters alike.
+    residual_m : (receiver, transmitter)
+        Range at the solution less range measured [m]; NaN where not received.
+    chi2 : (receiver,)
+        Sum of squared residuals in units of sigma.
+    n_transmitter, n_iteration : (receiver,)
+        Transmitters used, Gauss-Newton steps taken.
+    status : (receiver,)
+        `FixStatus` as int8.
+    """
+
+    position_enu_m: FloatArray
+    clock_m: FloatArray
+    cov_enu_m2: FloatArray
+    dop: FloatArray
+    residual_m: FloatArray
+    chi2: FloatArray
+    n_transmitter: IntArray
+    n_iteration: IntArray
+    status: StatusArray
+
+    @property
+    def ok(self) -> npt.NDArray[np.bool_]:
+        """(receiver,) True where the status is OK."""
+        return np.asarray(self.status == FixStatus.OK)
+
+    def reasons(self) -> tuple[str, ...]:
+        """Each row's status in words."""
+        return tuple(FixStatus(s).reason for s in self.status)
+
+
+def locate(
+    transmitter_enu_m: npt.ArrayLike,
+    range_difference_m: npt.ArrayLike,
+    *,
+    sigma_m: npt.ArrayLike | float,
+    start_enu_m: npt.ArrayLike | None = None,
+    max_dop: float = 100.0,
+    max_iteration: int = 30,
+    min_probability: float = 1e-9,
+) -> Fixes:
+    """Locate receivers from range differences by Gauss-Newton least squares [1]_.
+
+    Unknowns are the position and the range to the reference, d_r. With independent noise of each transmitter
+    this is maximum likelihood, and the choice of the reference has no influence.
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        Surveyed positions, site ENU frame [m]. With two columns the problem is solved in the plane.
+    range_difference_m : (receiver, transmitter)
+        Range to each transmitter minus range to the reference, up to one constant a row [m].
+        NaN = not received.
+    sigma_m : scalar, (transmitter,) or (receiver, transmitter)
+        Standard deviation of ONE transmitter's range [m]; not of a difference. NaN = not to be used.
+    start_enu_m : (xyz,) or (receiver, xyz), optional
+        Where to start; without it the start comes from linear equations, and a solution whose residuals are
+        unlikely is sought again from other starts.
+    max_dop
+        A larger dilution of precision makes a row WEAK_GEOMETRY.
+    max_iteration
+        Gauss-Newton steps before a row is given up.
+    min_probability
+        A row whose residuals are less likely than this is marked RESIDUAL; 0 marks none.
+
+    Returns
+    -------
+    Fixes
+
+    Raises
+    ------
+    InvalidInputError
+        Wrong shape, non-finite transmitter, ``sigma_m <= 0``, a setting out of range.
+    GeometryError
+        Too few transmitters for any row, two at the same place, or all on a line.
+
+    Notes
+    -----
+    A row that cannot be solved is returned as NaN with its reason in ``Fixes.status``.
+
+    References
+    ----------
+    .. [1] Swart et al., A method for accurate measurement of heliostat mirror orientation, §3.4.
+    """
+    transmitter = check_transmitters(transmitter_enu_m)
+    n_transmitter, n_axis = transmitter.shape
+    ranges = as_float_array("range_difference_m", range_difference_m, ("receiver", n_transmitter), finite=False)
+    max_dop = _positive_or_inf("max_dop", max_dop)
+    if not 1 <= max_iteration <= 10_000:
+        raise InvalidInputError(f"`max_iteration` must lie between 1 and 10000, got {max_iteration}")
+    if not 0.0 <= min_probability < 1.0:
+        raise InvalidInputError(f"`min_probability` must lie in [0, 1), got {min_probability}")
+    centre = np.zeros(3)
+    centre[:n_axis] = transmitter.mean(axis=0)
+    scale = float(np.sqrt(np.mean(np.sum((transmitter - centre[:n_axis]) ** 2, axis=1))))
+    weight = _weights(sigma_m, (len(ranges), n_transmitter), scale)
+    start = None
+    if start_enu_m is not None:
+        start = np.atleast_2d(as_float_array("start_enu_m", start_enu_m, ("...", n_axis)))
+        if start.shape not in ((1, n_axis), (len(ranges), n_axis)):
+            raise InvalidInputError(f"`start_enu_m` must have shape ({n_axis},) or (receiver, {n_axis})")
+    problem = _Problem(transmitter, centre, scale, max_iteration)
+    result = problem.solve(ranges, weight, start)
+    if start is None:
+        _restart(problem, ranges, weight, result)
+    _judge(result, n_axis, max_dop, min_probability)
+    return Fixes(**{name: read_only(array) for name, array in result.items()})
+
+
+def check_transmitters(transmitter_enu_m: npt.ArrayLike) -> FloatArray:
+    """Return transmitters as (transmitter, xyz or xy); raise `GeometryError` where no receiver could be located."""
+    array = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", "xyz"))
+    n, n_axis = array.shape
+    if n_axis not in (2, 3):
+        raise InvalidInputError(
+            f"`transmitter_enu_m` must have shape (transmitter, 3) or (transmitter, 2), got {array.shape}"
+        )
+    if n < n_axis + 2:
+        raise GeometryError(
+            f"`transmitter_enu_m` must hold {n_axis + 2} or more transmitters to solve {n_axis} dimensions from "
+            f"range differences, got {n}; add transmitters"
+        )
+    extent = float(np.ptp(array, axis=0).max())
+    for i in range(n - 1):
+        near = np.flatnonzero(np.linalg.norm(array[i + 1 :] - array[i], axis=1) <= 1e-9 * extent)
+        if near.size:
+            raise GeometryError(
+                f"`transmitter_enu_m` must hold different places, got "
+                f"transmitters {i} and {i + 1 + int(near[0])} at the same; move or remove one"
+            )
+    singular = np.linalg.svd(array - array.mean(axis=0), compute_uv=False)
+    if singular[1] <= 1e-9 * singular[0]:
+        raise GeometryError("`transmitter_enu_m` must not lie on one line: a line fixes no position; move some aside")
+    return array
+
+
+def _positive_or_inf(name: str, value: float) -> float:
+    return float("inf") if value == float("inf") else as_positive(name, value)
+
+
+def _weights(sigma_m: npt.ArrayLike | float, shape: tuple[int, int], scale: float) -> FloatArray:
+    """Return (scale/σ)² as one row for all receivers or one a receiver; NaN stays NaN and means unused."""
+    sigma = as_float_array("sigma_m", sigma_m, ("...",), finite=False, positive=True)
+    if np.any(np.isinf(sigma)):
+        raise InvalidInputError("`sigma_m` must be finite, or NaN where a transmitter is not to be used")
+    n_receiver, n_transmitter = shape
+    if sigma.shape not in ((), (n_transmitter,), (1, n_transmitter), (n_receiver, 1), (n_receiver, n_transmitter)):
+        raise InvalidInputError(
+            f"`sigma_m` must be a scalar or have shape (transmitter,) or (receiver, transmitter) = {shape}, "
+            f"got {sigma.shape}"
+        )
+    rows = len(sigma) if sigma.ndim == 2 else 1
+    return np.ascontiguousarray(np.broadcast_to((scale / sigma) ** 2, (rows, n_transmitter)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """What all rows share; turns arrays into the kernel's form and back."""
+
+    transmitter: FloatArray
+    centre: FloatArray
+    scale: float
+    max_iteration: int
+
+    def inside(self, position_enu_m: FloatArray) -> FloatArray:
+        """Return positions centred, scaled and with a z."""
+        out = np.zeros((len(position_enu_m), 3))
+        n_axis = self.transmitter.shape[1]
+        out[:, :n_axis] = (position_enu_m - self.centre[:n_axis]) / self.scale
+        return out
+
+    def solve(self, ranges: FloatArray, weight: FloatArray, start: FloatArray | None) -> dict[str, npt.NDArray[Any]]:
+        """Run the kernel on every row."""
+        n, n_transmitter = ranges.shape
+        n_axis = self.transmitter.shape[1]
+        result: dict[str, npt.NDArray[Any]] = {
+            "position_enu_m": np.empty((n, n_axis)),
+            "clock_m": np.empty(n),
+            "cov_enu_m2": np.empty((n, n_axis, n_axis)),
+            "dop": np.empty(n),
+            "residual_m": np.empty((n, n_transmitter)),
+            "chi2": np.empty(n),
+            "n_transmitter": np.empty(n, np.int16),
+            "n_iteration": np.empty(n, np.int16),
+            "status": np.empty(n, np.int8),
+        }
+        _kernels.locate_rows(
+            self.inside(self.transmitter), ranges, weight,
+            np.empty((0, 3)) if start is None else self.inside(start),
+            self.scale, self.centre, 3.0 - n_axis, self.max_iteration, STEP_TOLERANCE_SIGMA**2, n_axis + 2,
+            max(1, min(8 * (os.cpu_count() or 1), n // _kernels.LANES)), *result.values(),
+        )  # fmt: skip
+        return result
+
+    def other_starts(self, position_enu_m: FloatArray) -> list[FloatArray]:
+        """Where to try again: below, above and beside the transmitters, and mirrored through their plane."""
+        n_axis = self.transmitter.shape[1]
+        middle = self.centre[:n_axis]
+        axes = np.linalg.svd(self.transmitter - middle, full_matrices=False)[2]
+        up = axes[-1] if axes[-1][-1] >= 0 else -axes[-1]
+        n = len(position_enu_m)
+        starts = [np.broadcast_to(middle + h * self.scale * up, (n, n_axis)) for h in (-0.3, 0.3, -1.0, 1.0)]
+        for a in axes[:-1]:
+            starts += [np.broadcast_to(middle + (s * a - 0.3 * up) * self.scale, (n, n_axis)) for s in (-0.7, 0.7)]
+        height = (position_enu_m - middle) @ up
+        mirrored = position_enu_m - 2.0 * height[:, None] * up
+        return [np.where(np.isfinite(mirrored), mirrored, middle), *starts]
+
+
+def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: dict[str, npt.NDArray[Any]]) -> None:
+    """Solve unlikely or failed rows again from other starts, and keep the best solution of each."""
+    n_axis = problem.transmitter.shape[1]
+    limit = _chi2_limit(result["n_transmitter"] - (n_axis + 1), RESTART_PROBABILITY)
+    hopeless = (result["status"] == FixStatus.TOO_FEW) | (result["status"] == FixStatus.NOT_FINITE)
+    rows = np.flatnonzero(~hopeless & ~(result["chi2"] <= limit))
+    if not rows.size:
+        return
+    row_weight = weight if len(weight) == 1 else weight[rows]
+    for start in problem.other_starts(result["position_enu_m"][rows]):
+        again = problem.solve(ranges[rows], row_weight, start)
+        with np.errstate(invalid="ignore"):
+            better = (again["status"] == FixStatus.OK) & ~(again["chi2"] >= result["chi2"][rows])
+        for name, array in again.items():
+            result[name][rows[better]] = array[better]
+
+
+def _chi2_limit(dof: npt.NDArray[np.signedinteger[Any]], probability: float) -> FloatArray:
+    """Return the value that chi-squared exceeds with ``probability``, for each row's degrees of freedom."""
+    table = np.asarray(chi2_distribution.isf(probability, np.arange(max(int(dof.max(initial=0)), 0) + 1)))
+    return np.asarray(table[np.maximum(dof, 0)], np.float64)
+
+
+def _judge(result: dict[str, npt.NDArray[Any]], n_axis: int, max_dop: float, min_probability: float) -> None:
+    """Mark solved rows whose geometry is weak (and blank them) or whose residuals are unlikely."""
+    status = result["status"]
+    weak = (status == FixStatus.OK) & (result["dop"] > max_dop)
+    status[weak] = FixStatus.WEAK_GEOMETRY
+    for name in ("position_enu_m", "clock_m", "cov_enu_m2", "residual_m", "chi2"):
+        result[name][weak] = np.nan
+    if min_probability > 0.0:
+        limit = _chi2_limit(result["n_transmitter"] - (n_axis + 1), min_probability)
+        status[(status == FixStatus.OK) & (result["chi2"] > limit)] = FixStatus.RESIDUAL
