@@ -20,9 +20,10 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.recording.base import IqArray, Recording, RecordingFormat
 from rfpose.recording.drf import CENTRE_FREQUENCIES, import_digital_rf
 from rfpose.recording.opening import open_recording
+from rfpose.recording.output import temporary_beside
 from rfpose.recording.sidecar import SCENARIO_FILE
 from rfpose.recording.sigmf_files import DATATYPES, META_SUFFIX, import_sigmf
-from rfpose.recording.writer import RecordingWriter, temporary_beside
+from rfpose.recording.writer import RecordingWriter
 
 __all__ = ["convert"]
 

@@ -45,7 +45,7 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None) -> Rec
         return SigmfRecording(path, scenario=scenario)
     if path.suffix in (".sigmf", ".sigmf-collection"):
         raise RecordingError(
-            f"{path}: a SigMF archive or collection; unpack it (`tar xf`) and give the directory of the .sigmf-meta files"
+            f"{path}: a SigMF archive or collection; unpack it (`tar xf`) and give the directory of .sigmf-meta files"
         )
     return NativeRecording(path, scenario=scenario)
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +15,7 @@ import h5py
 import numpy as np
 
 from rfpose import __version__
-from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.errors import InvalidInputError
 from rfpose.recording import keys
 from rfpose.recording.base import (
     COMPONENT_DTYPE,
@@ -27,10 +25,11 @@ from rfpose.recording.base import (
     SampleFormat,
     as_compound,
 )
+from rfpose.recording.output import Hdf5Output, refuse_existing
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
-__all__ = ["RecordingWriter", "refuse_existing", "temporary_beside"]
+__all__ = ["RecordingWriter"]
 
 _CHUNK_BYTES = 2**20
 _SMALLEST_CHUNK_SAMPLES = 2**14
@@ -111,16 +110,17 @@ class RecordingWriter:
         self._sample_format: SampleFormat = sample_format
         self._full_scale = float(full_scale)
         self._provenance = dict(provenance)
-        self._temporary = temporary_beside(self.path)
-        self._file: h5py.File | None = None
+        self._output: Hdf5Output | None = None
         self._iq: dict[str, h5py.Dataset] = {}
         self._blocks: dict[str, list[list[int]]] = {name: [] for name in self._receiver_ids}
         self._stored = dict.fromkeys(self._receiver_ids, 0)
 
     def __enter__(self) -> Self:
+        cache = _CACHE_BYTES // len(self._receiver_ids)
+        self._output = Hdf5Output(self.path, overwrite=self._overwrite, rdcc_nbytes=cache)
         try:
-            with self._write_errors():
-                self._create()
+            with self._output.writing() as file:
+                self._create(file)
         except BaseException:
             self._discard()
             raise
@@ -131,8 +131,7 @@ class RecordingWriter:
     ) -> None:
         try:
             if error is None:
-                with self._write_errors():
-                    self._finish()
+                self._finish()
         finally:
             self._discard()
 
@@ -173,9 +172,10 @@ class RecordingWriter:
             )
         if len(samples) == 0:
             return
-        dataset = self._dataset(receiver_id)
+        output = self._opened()
+        dataset = self._iq[receiver_id]
         offset = self._stored[receiver_id]
-        with self._write_errors():
+        with output.writing():
             dataset.resize((offset + len(samples),))
             dataset.write_direct(
                 as_compound(np.ascontiguousarray(samples), self._sample_format),
@@ -189,8 +189,7 @@ class RecordingWriter:
 
     def write_truth(self, truth: Truth) -> None:
         """Write what was simulated; once."""
-        file = self._open_file()
-        with self._write_errors():
+        with self._opened().writing() as file:
             group = file.create_group(keys.TRUTH)
             for field in dataclasses.fields(truth):
                 value = getattr(truth, field.name)
@@ -201,9 +200,7 @@ class RecordingWriter:
 
     # -- the file ----------------------------------------------------------------------------------------
 
-    def _create(self) -> None:
-        cache = _CACHE_BYTES // len(self._receiver_ids)
-        self._file = file = h5py.File(self._temporary, "w", rdcc_nbytes=cache)
+    def _create(self, file: h5py.File) -> None:
         attrs = file.attrs
         attrs[keys.FORMAT] = keys.FORMAT_NAME
         attrs[keys.VERSION] = np.int64(keys.FORMAT_VERSION)
@@ -238,58 +235,22 @@ class RecordingWriter:
         return math.ceil(frame / math.ceil(frame / largest))
 
     def _finish(self) -> None:
-        file = self._open_file()
-        for receiver_id, blocks in self._blocks.items():
-            table = np.array(blocks, np.int64).reshape(-1, 3)
-            file[keys.RECEIVERS][receiver_id].create_dataset(keys.BLOCKS, data=table)
+        output = self._opened()
+        with output.writing() as file:
+            for receiver_id, blocks in self._blocks.items():
+                table = np.array(blocks, np.int64).reshape(-1, 3)
+                file[keys.RECEIVERS][receiver_id].create_dataset(keys.BLOCKS, data=table)
         self._iq.clear()
-        file.close()
-        self._file = None
-        with self._temporary.open("rb") as done:
-            os.fsync(done.fileno())  # a disk that fills late says so here, before the name is taken
-        refuse_existing(self.path, overwrite=self._overwrite)
-        self._temporary.replace(self.path)
+        output.commit()
 
     def _discard(self) -> None:
-        """Remove the temporary file; after a success there is none."""
+        """Remove what is unfinished; after a success there is nothing."""
         self._iq.clear()
-        if self._file is not None:
-            with contextlib.suppress(OSError, RuntimeError, ValueError):  # the first error is the one to report
-                self._file.close()
-            self._file = None
-        self._temporary.unlink(missing_ok=True)
+        if self._output is not None:
+            self._output.discard()
+            self._output = None
 
-    def _open_file(self) -> h5py.File:
-        if self._file is None:
+    def _opened(self) -> Hdf5Output:
+        if self._output is None:
             raise InvalidInputError(f"the writer of {self.path} is not open: use it in a `with` statement")
-        return self._file
-
-    def _dataset(self, receiver_id: str) -> h5py.Dataset:
-        self._open_file()
-        return self._iq[receiver_id]
-
-    @contextlib.contextmanager
-    def _write_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except RecordingError:
-            raise
-        except (OSError, RuntimeError) as error:  # HDF5 reports a full disk at close as a RuntimeError
-            reason = str(error).splitlines()[0]
-            raise RecordingError(
-                f"{self.path}: cannot write the recording: {reason}; free space on the disk, check that the directory "
-                "exists and may be written, or write elsewhere"
-            ) from error
-
-
-def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Raise unless ``path`` is free or may be replaced."""
-    if path.is_dir():
-        raise RecordingError(f"{path}: is a directory; give the name of a file")
-    if path.exists() and not overwrite:
-        raise RecordingError(f"{path}: exists already; choose another name or add `--force` to replace it")
-
-
-def temporary_beside(path: Path) -> Path:
-    """Return the name under which ``path`` is made before it takes its own."""
-    return path.with_name(f".{path.name}.{os.getpid()}.part")
+        return self._output
