@@ -1,0 +1,100 @@
+"""The group of commands, and what becomes of errors."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import traceback
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import click
+
+from rfpose import __version__
+from rfpose.cli._support import Session, emit_json
+from rfpose.errors import RfposeError
+
+__all__ = ["app"]
+
+COMMANDS = ("demo", "simulate", "info", "process", "evaluate", "convert", "bench")
+
+EXIT_UNEXPECTED = 1
+EXIT_BAD_DATA = 3
+EXIT_INTERRUPTED = 130
+
+
+class _LazyGroup(click.Group):
+    """Loads a sub-command's module when it is asked for, and turns errors into one line and an exit code."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = importlib.import_module(f"rfpose.cli.{cmd_name}").command
+        return command
+
+    def invoke(self, ctx: click.Context) -> Any:
+        session = ctx.ensure_object(Session)
+        try:
+            with _notes_to_stderr():
+                return super().invoke(ctx)
+        except KeyboardInterrupt:
+            click.echo(f"\nrfpose: {session.when_interrupted}", err=True)
+            ctx.exit(EXIT_INTERRUPTED)
+        except RfposeError as error:
+            _fail(ctx, session, str(error), EXIT_BAD_DATA)
+        except (BrokenPipeError, click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except MemoryError as error:
+            _fail(ctx, session, f"out of memory: {error or 'use shorter frames or fewer receivers'}", EXIT_BAD_DATA)
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename else ""
+            _fail(ctx, session, f"{place}{error.strerror or error}", EXIT_BAD_DATA)
+        except Exception as error:  # noqa: BLE001 -- the last resort: one line for the user, traceback on request
+            text = f"unexpected {type(error).__name__}: {error}; run again with --debug and report the traceback"
+            _fail(ctx, session, text, EXIT_UNEXPECTED)
+
+
+class _StderrHandler(logging.Handler):
+    """Shows what the library logs as one line each on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(f"rfpose: note: {record.getMessage()}", err=True)
+
+
+@contextlib.contextmanager
+def _notes_to_stderr() -> Iterator[None]:
+    """While it lasts, warnings of the library appear on standard error."""
+    handler = _StderrHandler(level=logging.WARNING)
+    logger = logging.getLogger("rfpose")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _fail(ctx: click.Context, session: Session, message: str, code: int) -> NoReturn:
+    """Print one line (and the traceback if asked for), give the JSON reader its object, and leave."""
+    if session.debug:
+        click.echo(traceback.format_exc(), err=True)
+    line = " ".join(message.split())
+    click.echo(f"rfpose: {line}", err=True)
+    if session.json:
+        emit_json({"error": line, "exit_code": code})
+    ctx.exit(code)
+
+
+@click.group(cls=_LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="rfpose", message="%(prog)s %(version)s")
+def app() -> None:
+    """Measure where heliostat mirrors point, by radio.
+
+    Transmitters around the field send ranging tones; receivers on the mirrors record them. From such a recording
+    come the receivers' positions and the mirrors' normals, with how far to trust them.
+
+    Start with `rfpose demo`.
+    """

@@ -1,0 +1,39 @@
+"""``rfpose demo``: the whole way on a simulated field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, table, wants_json
+
+__all__ = ["command"]
+
+
+@click.command(name="demo", epilog=examples("rfpose demo", "rfpose demo -o /tmp/field --seed 3 --json"))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("demo"),
+    show_default=True,
+    help="Directory for recording, result, table and pictures.",
+)
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Same seed, same recording.")
+@force_option
+@common_options
+def command(output: Path, seed: int, force: bool) -> None:
+    """Simulate a field of 12 heliostats, process the recording, evaluate it and draw it."""
+    from rfpose.pipeline.demo import STAGES, run_demo
+
+    with progress(STAGES[0]) as on_progress:
+        outcome = run_demo(output, seed=seed, force=force, on_progress=on_progress, on_stage=lambda text: say(text))
+    if wants_json():
+        emit_json({**outcome.evaluation.as_dict(), "files": outcome.files})
+        return
+    table("Mirror normals measured by radio", *outcome.evaluation.as_table())
+    for reason, count in outcome.evaluation.failure_reasons.items():
+        say(f"  {count} mirror-frames failed: {reason}")
+    for what, path in outcome.files.items():
+        say(f"{what.replace('_', ' ')}: {path}")

@@ -1,0 +1,122 @@
+"""What a long job has done so far, on disk, so that a killed one goes on where it stopped."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.errors import RecordingError
+from rfpose.pipeline.files import TEMPORARY_SUFFIX, make_directory, write_atomically
+
+__all__ = ["Entry", "Journal"]
+
+Entry = dict[str, npt.NDArray[Any]]
+
+_KEY_NAME = "key.json"
+_ENTRY_NAME = re.compile(r"rows-(\d{12})-(\d{12})\.npz")
+
+_log = logging.getLogger(__name__)
+
+
+class Journal:
+    """A directory of numbered entries; rows are numbered from zero without gaps.
+
+    Parameters
+    ----------
+    directory
+        Made if absent.
+    key
+        What the entries depend on, as text. Entries written under another key are never mixed in.
+    restart
+        Discard entries of another key instead of refusing.
+    resume
+        False: discard entries of the same key too.
+
+    Raises
+    ------
+    RecordingError
+        The directory holds the work of another key, holds something else, or cannot be read or written.
+    """
+
+    def __init__(self, directory: Path, key: Mapping[str, str], *, restart: bool, resume: bool = True) -> None:
+        self._directory = directory
+        found = self._read_key()
+        if found is None:
+            self._refuse_strangers()
+        elif found != dict(key):
+            if not restart:
+                differing = ", ".join(sorted(k for k in {*found, *key} if found.get(k) != key.get(k)))
+                raise RecordingError(
+                    f"{directory}: holds the unfinished work of another job (different: {differing}); repeat that "
+                    "job's command to finish it, or start over with --force"
+                )
+            self.remove()
+        elif not resume:
+            self.remove()
+        make_directory(directory)
+        write_atomically(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())
+
+    def _read_key(self) -> dict[str, str] | None:
+        try:
+            found = json.loads((self._directory / _KEY_NAME).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) else None
+
+    def _refuse_strangers(self) -> None:
+        """Without a key, only what a job leaves that was killed while it wrote the key may be there."""
+        if self._directory.is_dir() and all(self._is_own(path) for path in self._directory.iterdir()):
+            return
+        if self._directory.exists():
+            raise RecordingError(f"{self._directory}: is in the way and no unfinished work of rfpose; move it aside")
+
+    @staticmethod
+    def _is_own(path: Path) -> bool:
+        return path.name == _KEY_NAME or path.suffix == TEMPORARY_SUFFIX or _ENTRY_NAME.fullmatch(path.name) is not None
+
+    def read(self) -> list[tuple[int, int, Entry]]:
+        """Return ``(first row, end row, arrays)`` of the entries from row zero on; what follows a damaged one is lost.
+
+        A damaged entry is one that a power cut left incomplete; its rows are measured again.
+        """
+        entries: list[tuple[int, int, Entry]] = []
+        end = 0
+        for path in sorted(self._directory.glob("rows-*.npz")):
+            match = _ENTRY_NAME.fullmatch(path.name)
+            if match is None or int(match[1]) != end:
+                break
+            try:
+                with np.load(path, allow_pickle=False) as file:
+                    arrays = {name: file[name] for name in file.files}
+            except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                _log.warning("%s is damaged (%s); that part is measured again", path, error)
+                break
+            entries.append((end, int(match[2]), arrays))
+            end = int(match[2])
+        return entries
+
+    def append(self, first_row: int, end_row: int, arrays: Entry) -> None:
+        """Write one entry; it is there in whole or not at all."""
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]
+        write_atomically(self._directory / f"rows-{first_row:012d}-{end_row:012d}.npz", buffer.getvalue())
+
+    def remove(self) -> None:
+        """Delete the entries and, unless something else is in it, the directory."""
+        try:
+            for path in list(self._directory.iterdir()):
+                if self._is_own(path):
+                    path.unlink()
+            if not any(self._directory.iterdir()):
+                self._directory.rmdir()
+        except OSError as error:
+            raise RecordingError(f"{self._directory}: cannot remove: {error.strerror or error}") from error

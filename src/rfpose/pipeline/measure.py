@@ -1,0 +1,159 @@
+"""From IQ to tone phases for a whole recording: frame after frame, receiver after receiver, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import __version__
+from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
+from rfpose.pipeline._journal import Entry, Journal
+from rfpose.recording import Recording
+from rfpose.scenario import Scenario
+
+__all__ = ["JOURNAL_SAMPLES", "journal_key", "measure_tones"]
+
+JOURNAL_SAMPLES = 40_000_000
+"""Samples measured between two entries of the journal: about a second's work."""
+
+_MAX_ENTRY_ROWS = 4096
+_PROBE_SAMPLES = 1024
+_CLOCK_STATE = "clock_state_ppm"
+
+Samples = npt.NDArray[Any]
+
+
+def journal_key(recording: Recording, scenario: Scenario, estimator: str) -> dict[str, str]:
+    """Return what measured phases depend on; it does not change when the files move."""
+    return {
+        "scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest(),
+        "recording": _fingerprint(recording),
+        "estimator": estimator,
+        "rfpose version": __version__,
+    }
+
+
+def _fingerprint(recording: Recording) -> str:
+    """Hash a recording's shape and some of its samples, so that another recording of the same shape differs."""
+    facts = [recording.receiver_ids, str(recording.sample_rate), recording.sample_format, str(recording.full_scale)]
+    found = hashlib.sha256(json.dumps(facts).encode())
+    for receiver_id in recording.receiver_ids:
+        blocks = recording.blocks(receiver_id)
+        found.update(np.ascontiguousarray(blocks, "<i8").tobytes())
+        for start, count in blocks[[0, -1]] if len(blocks) else ():
+            n = min(int(count), _PROBE_SAMPLES)
+            found.update(recording.read(receiver_id, int(start), n).tobytes())
+            found.update(recording.read(receiver_id, int(start + count) - n, n).tobytes())
+    return found.hexdigest()
+
+
+def measure_tones(
+    recording: Recording,
+    scenario: Scenario,
+    frame_start_index: npt.NDArray[np.int64],
+    *,
+    estimator: str,
+    journal: Journal | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> TonePhases:
+    """Measure every tone in every frame of every receiver.
+
+    Parameters
+    ----------
+    recording
+        Open recording; a receiver that it lacks, and a frame with a gap, become NaN with a status.
+    scenario
+        The site; its receiver axis is the result's.
+    frame_start_index : (frame,)
+        First sample of each frame since the Unix epoch.
+    estimator
+        One of `rfpose.dsp.ESTIMATORS`.
+    journal
+        What was measured before is taken from here, what is measured is added.
+    on_progress
+        Called with (rows done, rows in all); a row is one receiver in one frame.
+
+    Raises
+    ------
+    RecordingError
+        The recording is damaged, or the journal cannot be written.
+    """
+    n_receiver = len(scenario.receiver_ids)
+    n_row = len(frame_start_index) * n_receiver
+    tones = TonePhases.empty(
+        receiver_ids=scenario.receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        tone_hz=scenario.tone_hz,
+        frame_start_index=frame_start_index,
+    )
+    rows = _rows(tones)
+    # where each receiver's clock was last seen; it is searched anew after a frame in which nothing was found
+    clock_ppm = np.full(n_receiver, np.nan)
+    done = 0
+    for first, end, entry in journal.read() if journal is not None else ():
+        for name, values in rows.items():
+            values[first:end] = entry[name]
+        clock_ppm[:] = entry[_CLOCK_STATE]
+        done = end
+    extractor = ToneExtractor(LinePlan.from_scenario(scenario), estimator, full_scale=recording.full_scale)
+    per_entry = max(1, min(_MAX_ENTRY_ROWS, JOURNAL_SAMPLES // scenario.radio.frame_samples))
+    while done < n_row:
+        first, end = done, min(done + per_entry, n_row)
+        with closing(_read_ahead(recording, scenario, frame_start_index, range(first, end))) as frames:
+            for samples in frames:
+                i_frame, i_receiver = divmod(done, n_receiver)
+                found = _measure(extractor, samples, float(clock_ppm[i_receiver]))
+                tones.put(i_frame, i_receiver, found)
+                clock_ppm[i_receiver] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
+                done += 1
+                if on_progress is not None:
+                    on_progress(done, n_row)
+        if journal is not None:
+            entry = {name: values[first:end] for name, values in rows.items()}
+            journal.append(first, end, {**entry, _CLOCK_STATE: clock_ppm})
+    return tones
+
+
+def _rows(tones: TonePhases) -> Entry:
+    """Return views of the arrays with frame and receiver in one axis."""
+    arrays = {name: getattr(tones, name) for name in FrameTones.__dataclass_fields__}
+    return {name: array.reshape(-1, *array.shape[2:], copy=False) for name, array in arrays.items()}
+
+
+def _measure(extractor: ToneExtractor, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
+    if isinstance(samples, LineStatus):
+        return FrameTones.failed(extractor.plan.n_transmitter, extractor.plan.n_tone, samples)
+    return extractor.measure(samples, clock_ppm=clock_ppm)
+
+
+def _read_ahead(
+    recording: Recording, scenario: Scenario, frame_start_index: npt.NDArray[np.int64], rows: range
+) -> Iterator[Samples | LineStatus]:
+    """Yield each row's samples, or why there are none, while a thread reads the next; two buffers take turns."""
+    n_sample = scenario.radio.frame_samples
+    receiver_ids = scenario.receiver_ids
+    buffers = [np.empty((n_sample, 2), recording.component_dtype) for _ in range(2)]
+
+    def read(row: int) -> Samples | LineStatus:
+        i_frame, i_receiver = divmod(row, len(receiver_ids))
+        receiver_id, start = receiver_ids[i_receiver], int(frame_start_index[i_frame])
+        if receiver_id not in recording.receiver_ids:
+            return LineStatus.NOT_RECORDED
+        if not recording.covers(receiver_id, start, n_sample):
+            return LineStatus.GAP
+        return recording.read(receiver_id, start, n_sample, out=buffers[row % 2])
+
+    with ThreadPoolExecutor(1, thread_name_prefix="rfpose-read") as pool:
+        ahead: Future[Samples | LineStatus] = pool.submit(read, rows[0])
+        for following in rows[1:]:
+            samples = ahead.result()
+            ahead = pool.submit(read, following)
+            yield samples
+        yield ahead.result()

@@ -1,0 +1,192 @@
+"""The main job: a recording in, a result file out; resumable, and nothing half written."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import __version__
+from rfpose.dsp import ESTIMATORS
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.pipeline._journal import Journal
+from rfpose.pipeline.files import refuse_existing
+from rfpose.pipeline.measure import journal_key, measure_tones
+from rfpose.pipeline.result_file import Result, write_result
+from rfpose.pipeline.solve import check_solvable, solve
+from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.scenario import Scenario, load_scenario
+from rfpose.truth import Truth
+
+__all__ = ["process"]
+
+_log = logging.getLogger(__name__)
+
+
+def process(
+    recording_path: str | Path,
+    result_path: str | Path,
+    *,
+    scenario_path: str | Path | None = None,
+    estimator: str = "hilbert",
+    pose: str = "independent",
+    force: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+    resume: bool = True,
+) -> Result:
+    """Find receiver positions and mirror normals in a recording and write them to a file.
+
+    Measured tone phases are kept in the directory ``RESULT.partial`` until the result is written. After an
+    interruption the same call goes on from there and gives the same bytes as an undisturbed one.
+
+    Parameters
+    ----------
+    recording_path
+        Whatever `rfpose.recording.open_recording` opens.
+    result_path
+        File to write, format ``rfpose-result``.
+    scenario_path
+        Site description; wins over the one in the recording.
+    estimator
+        How tone phases are measured, one of `rfpose.dsp.ESTIMATORS`.
+    pose
+        How normals follow from phases, one of `rfpose.pipeline.solve.POSES`.
+    force
+        Overwrite an existing result, and discard unfinished work of another job on the same result.
+    on_progress
+        Called with (rows done, rows in all); a row is one receiver in one frame.
+    resume
+        False: measure everything again even if unfinished work of the same job is there.
+
+    Raises
+    ------
+    RecordingError
+        A file that is missing, damaged, exists already or cannot be written.
+    ScenarioError
+        No scenario, or one that disagrees with the recording or cannot be solved.
+    GeometryError
+        The site admits no solution, or an ambiguous one.
+    InvalidInputError
+        Unknown ``estimator`` or ``pose``.
+    """
+    recording_path, result_path = Path(recording_path), Path(result_path)
+    if estimator not in ESTIMATORS:
+        raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+    refuse_existing(result_path, force=force)
+    given = None if scenario_path is None else load_scenario(scenario_path)
+    with open_recording(recording_path) as recording:
+        scenario = _choose_scenario(recording, given)
+        check_against(recording, scenario)
+        check_solvable(scenario, pose=pose)
+        _note_differing_receivers(recording, scenario)
+        starts = _frames(recording, scenario)
+        journal = Journal(
+            result_path.with_name(f"{result_path.name}.partial"),
+            journal_key(recording, scenario, estimator),
+            restart=force,
+            resume=resume,
+        )
+        tones = measure_tones(
+            recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
+        )
+        settings = _settings(recording, estimator=estimator, pose=pose, scenario_path=scenario_path)
+        truth = None if recording.truth is None else align_truth(recording.truth, scenario)
+    result = solve(tones, scenario, settings=settings, truth=truth)
+    write_result(result, result_path)
+    journal.remove()
+    return result
+
+
+def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:
+    embedded = recording.scenario
+    if given is None:
+        if embedded is None:
+            raise ScenarioError(
+                f"{recording.path}: holds no scenario; describe the site in TOML and give --scenario FILE"
+            )
+        return embedded
+    if embedded is not None and embedded != given:
+        _log.warning("%s: its scenario differs from the given one; the given one is used", recording.path)
+    return given
+
+
+def _note_differing_receivers(recording: Recording, scenario: Scenario) -> None:
+    missing = [name for name in scenario.receiver_ids if name not in recording.receiver_ids]
+    if missing:
+        _log.warning("%s: lacks %s of the scenario; marked as not recorded", recording.path, _listed(missing))
+    unknown = [name for name in recording.receiver_ids if name not in scenario.receiver_ids]
+    if unknown:
+        _log.warning("%s: has %s, which the scenario does not name; left out", recording.path, _listed(unknown))
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    return f"receiver{'s' if len(names) > 1 else ''} {', '.join(names[:5])}{more}"
+
+
+def _frames(recording: Recording, scenario: Scenario) -> npt.NDArray[np.int64]:
+    n_sample = scenario.radio.frame_samples
+    starts = frame_starts(recording, n_sample)
+    if not len(starts):
+        raise RecordingError(
+            f"{recording.path}: no stretch as long as a frame of {n_sample} samples; shorten radio.frame_samples"
+        )
+    return starts
+
+
+def _settings(recording: Recording, *, estimator: str, pose: str, scenario_path: str | Path | None) -> dict[str, str]:
+    """Return what the result depends on, without places and times: equal work gives equal bytes."""
+    command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {pose}"
+    if scenario_path is not None:
+        command += f" --scenario {Path(scenario_path).name}"
+    return {
+        "version": __version__,
+        "command": command,
+        "recording": recording.path.name,
+        "recording_format": recording.format,
+        "sample_rate": str(recording.sample_rate),
+        "scenario_from": "recording" if scenario_path is None else "file",
+        "estimator": estimator,
+        "pose": pose,
+    }
+
+
+def align_truth(truth: Truth, scenario: Scenario) -> Truth:
+    """Put a truth's rows into the order of a scenario's; what it does not know becomes NaN."""
+    heliostat = _order(truth.heliostat_ids, scenario.heliostat_ids)
+    receiver = _order(truth.receiver_ids, scenario.receiver_ids)
+    transmitter = _order(truth.transmitter_ids, scenario.transmitter_ids)
+    snr = _taken(truth.tone_snr, receiver, axis=1)
+    return Truth(
+        heliostat_ids=scenario.heliostat_ids,
+        receiver_ids=scenario.receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        normal_enu=_taken(truth.normal_enu, heliostat, axis=1),
+        receiver_enu_m=_taken(truth.receiver_enu_m, receiver, axis=1),
+        frame_start_index=truth.frame_start_index,
+        transmitter_phase_rad=_taken(truth.transmitter_phase_rad, transmitter, axis=1),
+        clock_ppm=_taken(truth.clock_ppm, receiver, axis=0),
+        receiver_delay_s=_taken(truth.receiver_delay_s, receiver, axis=1),
+        tone_snr=_taken(snr, transmitter, axis=2),
+    )
+
+
+def _order(found: Sequence[str], wanted: Sequence[str]) -> npt.NDArray[np.int64]:
+    """Return where each wanted name stands among those found, −1 for nowhere."""
+    place = {name: i for i, name in enumerate(found)}
+    return np.array([place.get(name, -1) for name in wanted], np.int64)
+
+
+def _taken(array: Any, index: npt.NDArray[np.int64], *, axis: int) -> Any:
+    if array is None:
+        return None
+    shape = [len(index) if i == axis else n for i, n in enumerate(array.shape)]
+    out = np.full(shape, np.nan)
+    known = np.flatnonzero(index >= 0)
+    place = (slice(None),) * axis
+    out[(*place, known)] = array[(*place, index[known])]
+    return out

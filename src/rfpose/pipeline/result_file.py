@@ -1,0 +1,495 @@
+"""What processing found, and its file: format ``rfpose-result``, HDF5, described in ``docs/result-format.md``.
+
+Every name in the file stands in `KEYS`, with axes, unit and meaning; writer and reader both follow it.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from enum import IntEnum
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, read_only
+from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
+from rfpose.errors import RecordingError, ScenarioError
+from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus
+from rfpose.pipeline.files import write_atomically
+from rfpose.scenario import Scenario, parse_scenario
+from rfpose.truth import Truth
+
+__all__ = [
+    "FORMAT",
+    "KEYS",
+    "VERSION",
+    "FixTable",
+    "Key",
+    "PoseTable",
+    "Result",
+    "StatusArray",
+    "frame_time",
+    "is_result",
+    "read_result",
+    "summarise",
+    "write_poses_csv",
+    "write_result",
+]
+
+FORMAT = "rfpose-result"
+VERSION = 1
+
+StatusArray = npt.NDArray[np.int8]
+
+
+# -- records -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixTable:
+    """Positions of the receivers, each located on its own: `rfpose.multilat.Fixes` with a frame axis.
+
+    Attributes
+    ----------
+    position_enu_m : (frame, receiver, xyz)
+        Site ENU [m]. NaN = not solved.
+    cov_enu_m2 : (frame, receiver, xyz, xyz)
+        Covariance, calibration included [m²].
+    clock_m : (frame, receiver)
+        Range to the reference transmitter [m].
+    dop : (frame, receiver)
+        Position RMS over the standard deviation of one transmitter's range, all alike.
+    residual_m : (frame, receiver, transmitter)
+        Computed less measured range [m].
+    chi2 : (frame, receiver)
+        Sum of squared residuals over their variances.
+    n_transmitter, n_iteration : (frame, receiver)
+        Transmitters used, Gauss-Newton steps taken.
+    status : (frame, receiver)
+        `rfpose.multilat.FixStatus`.
+    """
+
+    position_enu_m: FloatArray
+    cov_enu_m2: FloatArray
+    clock_m: FloatArray
+    dop: FloatArray
+    residual_m: FloatArray
+    chi2: FloatArray
+    n_transmitter: npt.NDArray[np.int16]
+    n_iteration: npt.NDArray[np.int16]
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseTable:
+    """Mirror normals: `rfpose.multilat.Normals` with the mirrors' places.
+
+    Attributes
+    ----------
+    normal_enu : (frame, heliostat, xyz)
+        Unit length, out of the mirror's front. NaN = not solved.
+    cov_enu : (frame, heliostat, xyz, xyz)
+        Covariance of ``normal_enu`` (singular along the normal) [rad²].
+    sigma_rad : (frame, heliostat)
+        RMS angle of the normal's error, both axes together [rad].
+    azimuth_rad, elevation_rad : (frame, heliostat)
+        Of the normal; azimuth from north, clockwise [rad].
+    centre_enu_m : (frame, heliostat, xyz)
+        Mean position of the located receivers, site ENU [m].
+    n_receiver : (frame, heliostat)
+        Receivers used.
+    status : (frame, heliostat)
+        `rfpose.multilat.PoseStatus`.
+    """
+
+    normal_enu: FloatArray
+    cov_enu: FloatArray
+    sigma_rad: FloatArray
+    azimuth_rad: FloatArray
+    elevation_rad: FloatArray
+    centre_enu_m: FloatArray
+    n_receiver: npt.NDArray[np.int16]
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """All that processing a recording found.
+
+    Attributes
+    ----------
+    scenario
+        The site as it was processed; its receiver axis is the receiver axis here.
+    settings
+        What the result depends on besides the recording, as text.
+    frame_start_index : (frame,)
+        First sample of each frame, counted from the Unix epoch at the recording's sample rate.
+    tones, calibration, ranges, fixes, poses
+        The stages in order.
+    truth
+        What was really there, copied from a simulated recording; else None.
+    """
+
+    scenario: Scenario
+    settings: Mapping[str, str]
+    frame_start_index: npt.NDArray[np.int64]
+    tones: TonePhases
+    calibration: Calibration
+    ranges: RangeDifferences
+    fixes: FixTable
+    poses: PoseTable
+    truth: Truth | None = None
+
+    @property
+    def sample_rate(self) -> Fraction:
+        """Nominal sample rate [1/s]."""
+        return Fraction(self.settings["sample_rate"])
+
+
+def frame_time(start_index: int, sample_rate: Fraction) -> datetime:
+    """Return the UTC time of a sample counted from the Unix epoch, to the microsecond."""
+    microseconds = int(start_index * 1_000_000 / sample_rate)
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=microseconds)
+
+
+# -- the names in the file -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One dataset: its axes (a number is a fixed length), numpy type, unit and meaning."""
+
+    axes: tuple[str | int, ...]
+    dtype: str
+    unit: str
+    meaning: str
+
+
+_FR = ("frame", "receiver")
+_FRT = (*_FR, "transmitter")
+_FRTQ = (*_FRT, "tone")
+_FTQ = ("frame", "transmitter", "tone")
+_FH = ("frame", "heliostat")
+
+KEYS: Mapping[str, Key] = {
+    "frames/start_index": Key(("frame",), "i8", "sample", "first sample since the Unix epoch at the nominal rate"),
+    "tones/phase_rad": Key(_FRTQ, "f8", "rad", "tone phase, not yet calibrated"),
+    "tones/sigma_rad": Key(_FRTQ, "f8", "rad", "its standard deviation"),
+    "tones/carrier": Key(_FRT, "c16", "counts", "complex amplitude of the carrier"),
+    "tones/carrier_sigma": Key(_FRT, "f8", "counts", "standard deviation of its real and imaginary part"),
+    "tones/sideband": Key((*_FRTQ, 2), "c16", "counts", "complex amplitude of upper and lower sideband"),
+    "tones/sideband_sigma": Key((*_FRTQ, 2), "f8", "counts", "standard deviation of real and imaginary part"),
+    "tones/clock_ppm": Key(_FR, "f8", "1e-6", "offset of the receiver's clock"),
+    "tones/clock_sigma_ppm": Key(_FR, "f8", "1e-6", "its standard deviation"),
+    "tones/noise_variance": Key(_FR, "f8", "counts2", "variance of the complex noise in the band"),
+    "tones/clipped_fraction": Key(_FR, "f8", "1", "part of the samples at full scale"),
+    "tones/status": Key(_FRT, "u1", "code", "what is wrong with the line, 0 nothing"),
+    "calibration/phase_rad": Key(_FTQ, "f8", "rad", "electronic phase of the transmitter's tone"),
+    "calibration/sigma_rad": Key(_FTQ, "f8", "rad", "its standard deviation"),
+    "calibration/drift_rad_per_sqrt_s": Key(("tone",), "f8", "rad/s^0.5", "random-walk rate seen between frames"),
+    "calibration/status": Key(("frame", "transmitter"), "u1", "code", "where it comes from, 0 measured in this frame"),
+    "ranges/range_difference_m": Key(_FRT, "f8", "m", "range less that to the reference, up to one constant a row"),
+    "ranges/sigma_m": Key(_FRT, "f8", "m", "standard deviation of ONE transmitter's range, receiver noise"),
+    "ranges/calibration_sigma_m": Key(_FRT, "f8", "m", "the same from calibration, common to a frame's receivers"),
+    "ranges/reference": Key(_FR, "i8", "index", "reference transmitter, -1 none"),
+    "ranges/status": Key(_FRT, "i1", "code", "why a range is missing or poorer, 0 measured with every tone"),
+    "fixes/position_enu_m": Key((*_FR, 3), "f8", "m", "receiver position, east, north, up"),
+    "fixes/cov_enu_m2": Key((*_FR, 3, 3), "f8", "m2", "its covariance"),
+    "fixes/clock_m": Key(_FR, "f8", "m", "range to the reference transmitter"),
+    "fixes/dop": Key(_FR, "f8", "1", "position RMS over the deviation of one range"),
+    "fixes/residual_m": Key(_FRT, "f8", "m", "computed less measured range"),
+    "fixes/chi2": Key(_FR, "f8", "1", "sum of squared residuals over variances"),
+    "fixes/n_transmitter": Key(_FR, "i2", "1", "transmitters used"),
+    "fixes/n_iteration": Key(_FR, "i2", "1", "Gauss-Newton steps"),
+    "fixes/status": Key(_FR, "i1", "code", "why a fix is missing, 0 solved"),
+    "poses/normal_enu": Key((*_FH, 3), "f8", "1", "mirror normal, unit length, east, north, up"),
+    "poses/cov_enu": Key((*_FH, 3, 3), "f8", "rad2", "its covariance"),
+    "poses/sigma_rad": Key(_FH, "f8", "rad", "RMS angle of the normal's error, both axes together"),
+    "poses/azimuth_rad": Key(_FH, "f8", "rad", "azimuth of the normal, from north, clockwise"),
+    "poses/elevation_rad": Key(_FH, "f8", "rad", "elevation of the normal"),
+    "poses/centre_enu_m": Key((*_FH, 3), "f8", "m", "mean position of the located receivers"),
+    "poses/n_receiver": Key(_FH, "i2", "1", "receivers used"),
+    "poses/status": Key(_FH, "i1", "code", "why a pose is missing, 0 solved"),
+    "truth/frame_start_index": Key(("truth_frame",), "i8", "sample", "frames of the truth"),
+    "truth/normal_enu": Key(("truth_frame", "heliostat", 3), "f8", "1", "true mirror normal"),
+    "truth/receiver_enu_m": Key(("truth_frame", "receiver", 3), "f8", "m", "true receiver position"),
+    "truth/transmitter_phase_rad": Key(("truth_frame", "transmitter", "tone"), "f8", "rad", "true electronic phase"),
+    "truth/clock_ppm": Key(("receiver",), "f8", "1e-6", "true clock offset"),
+    "truth/receiver_delay_s": Key(("truth_frame", "receiver"), "f8", "s", "true hardware delay"),
+    "truth/tone_snr": Key(("truth_frame", "receiver", "transmitter", "tone"), "f8", "1", "true SNR per sample"),
+}
+"""Datasets by path. Those under ``truth/`` may be absent, each on its own."""
+
+_STATUS: Mapping[str, type[IntEnum]] = {
+    "tones/status": LineStatus,
+    "calibration/status": CalibrationStatus,
+    "ranges/status": RangeStatus,
+    "fixes/status": FixStatus,
+    "poses/status": PoseStatus,
+}
+
+
+def _group_keys(group: str) -> list[str]:
+    return [path.partition("/")[2] for path in KEYS if path.startswith(f"{group}/")]
+
+
+# -- writing -------------------------------------------------------------------------------------------------
+
+
+def write_result(result: Result, path: str | Path) -> None:
+    """Write a result in one go; the same result gives the same bytes.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be written; what stood under ``path`` is untouched.
+    """
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=("v110", "v110")) as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["version"] = VERSION
+        file.create_dataset("scenario", data=result.scenario.to_toml())
+        settings = file.create_group("settings")
+        for name, text in sorted(result.settings.items()):
+            settings.attrs[name] = text
+        for name in ("receiver_ids", "transmitter_ids", "heliostat_ids"):
+            file.create_dataset(f"ids/{name}", data=np.array(getattr(result.scenario, name), dtype=object), dtype=_TEXT)
+        _write(file, "frames/start_index", result.frame_start_index)
+        for group in ("tones", "calibration", "ranges", "fixes", "poses"):
+            record = getattr(result, group)
+            for name in _group_keys(group):
+                _write(file, f"{group}/{name}", getattr(record, name))
+        if result.truth is not None:
+            for name in _group_keys("truth"):
+                values = getattr(result.truth, name)
+                if values is not None:
+                    _write(file, f"truth/{name}", values)
+    write_atomically(path, image.getvalue())
+
+
+_TEXT = h5py.string_dtype()
+
+
+def _write(file: h5py.File, path: str, values: npt.ArrayLike) -> None:
+    key = KEYS[path]
+    dataset = file.create_dataset(path, data=np.asarray(values, dtype=key.dtype))
+    dataset.attrs["unit"] = key.unit
+    dataset.attrs["axes"] = ", ".join(str(axis) for axis in key.axes)
+    dataset.attrs["meaning"] = key.meaning
+    if path in _STATUS:
+        dataset.attrs["codes"] = "; ".join(f"{code.value} {code.reason}" for code in _STATUS[path])  # type: ignore[attr-defined]
+
+
+# -- reading -------------------------------------------------------------------------------------------------
+
+
+def is_result(path: str | Path) -> bool:
+    """Tell whether a file says that it is an rfpose-result; false for whatever cannot be opened."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("format") == FORMAT)
+    except OSError:
+        return False
+
+
+def read_result(path: str | Path) -> Result:
+    """Read a result.
+
+    Raises
+    ------
+    RecordingError
+        Missing, truncated, not HDF5, another format or version, or a dataset that is missing or has the wrong
+        type or shape; the message names the file and the place.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file; make it with `rfpose process`")
+    try:
+        with h5py.File(path, "r") as file:
+            return _Reader(path, file).result()
+    except RecordingError:
+        raise
+    except (OSError, RuntimeError, KeyError) as error:
+        raise RecordingError(
+            f"{path}: cannot be read as HDF5 ({error}); it is truncated or another kind of file: process again"
+        ) from error
+
+
+class _Reader:
+    """Reads one open file; each complaint names the file and the place in it."""
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self._path = path
+        self._file = file
+        self._length: dict[str, int] = {}
+
+    def result(self) -> Result:
+        found = self._file.attrs.get("format")
+        if found != FORMAT:
+            raise self._error(f"is no {FORMAT} file (format: {found or 'none'})", "give what `rfpose process` wrote")
+        version = self._file.attrs.get("version")
+        if version != VERSION:
+            raise self._error(f"has version {version} of {FORMAT}, this rfpose reads {VERSION}", "process again")
+        scenario = self._scenario()
+        self._length = {
+            "receiver": len(scenario.receiver_ids),
+            "transmitter": len(scenario.transmitter_ids),
+            "tone": len(scenario.tone_hz),
+            "heliostat": len(scenario.heliostat_ids),
+        }
+        start_index = self._array("frames/start_index")
+        tones = self._group("tones")
+        return Result(
+            scenario=scenario,
+            settings=self._settings(),
+            frame_start_index=start_index,
+            tones=TonePhases(
+                **tones,
+                receiver_ids=scenario.receiver_ids,
+                transmitter_ids=scenario.transmitter_ids,
+                tone_hz=scenario.tone_hz,
+                frame_start_index=start_index,
+            ),
+            calibration=Calibration(**self._group("calibration")),
+            ranges=RangeDifferences(**self._group("ranges")),
+            fixes=FixTable(**self._group("fixes")),
+            poses=PoseTable(**self._group("poses")),
+            truth=self._truth(scenario),
+        )
+
+    def _error(self, what: str, remedy: str) -> RecordingError:
+        return RecordingError(f"{self._path}: {what}; {remedy}")
+
+    def _scenario(self) -> Scenario:
+        dataset = self._file.get("scenario")
+        if not isinstance(dataset, h5py.Dataset) or dataset.shape != ():
+            raise self._error("`/scenario` is missing or no text", "process again")
+        try:
+            return parse_scenario(dataset.asstr()[()], source=f"{self._path}:/scenario")
+        except (ScenarioError, TypeError) as error:
+            raise RecordingError(str(error)) from error
+
+    def _settings(self) -> dict[str, str]:
+        group = self._file.get("settings")
+        settings = {} if group is None else {name: str(value) for name, value in group.attrs.items()}
+        if "sample_rate" not in settings:
+            raise self._error("`/settings` is missing or lacks `sample_rate`", "process again")
+        return settings
+
+    def _group(self, group: str) -> dict[str, npt.NDArray[Any]]:
+        return {name: self._array(f"{group}/{name}") for name in _group_keys(group)}
+
+    def _truth(self, scenario: Scenario) -> Truth | None:
+        if "truth" not in self._file:
+            return None
+        arrays = {name: self._array(f"truth/{name}") for name in _group_keys("truth") if name in self._file["truth"]}
+        for name in ("normal_enu", "receiver_enu_m"):
+            if name not in arrays:
+                raise self._error(f"`/truth/{name}` is missing", "process again")
+        return Truth(
+            heliostat_ids=scenario.heliostat_ids,
+            receiver_ids=scenario.receiver_ids,
+            transmitter_ids=scenario.transmitter_ids,
+            **arrays,
+        )
+
+    def _array(self, path: str) -> npt.NDArray[Any]:
+        key = KEYS[path]
+        dataset = self._file.get(path)
+        if not isinstance(dataset, h5py.Dataset):
+            raise self._error(f"`/{path}` is missing", "process again")
+        if dataset.dtype.kind != np.dtype(key.dtype).kind:
+            raise self._error(f"`/{path}` holds {dataset.dtype}, not {np.dtype(key.dtype)}", "process again")
+        expected = tuple(axis if isinstance(axis, int) else self._length.get(axis) for axis in key.axes)
+        fits = len(expected) == dataset.ndim and all(
+            want is None or want == got for want, got in zip(expected, dataset.shape, strict=True)
+        )
+        if not fits:
+            axes = ", ".join(str(axis) for axis in key.axes)
+            raise self._error(f"`/{path}` has shape {dataset.shape}, not ({axes})", "process again")
+        for axis, got in zip(key.axes, dataset.shape, strict=True):
+            if isinstance(axis, str):
+                self._length.setdefault(axis, got)
+        return read_only(np.asarray(dataset[()], dtype=key.dtype))
+
+
+# -- for people ----------------------------------------------------------------------------------------------
+
+
+def reasons(status: npt.NDArray[Any], codes: type[IntEnum]) -> dict[str, int]:
+    """Count what went wrong, most frequent first; what went well is left out."""
+    counted = Counter(int(code) for code in status.ravel() if code != 0)
+    return {codes(code).reason: n for code, n in counted.most_common()}  # type: ignore[attr-defined]
+
+
+def summarise(result: Result) -> dict[str, Any]:
+    """Return counts of what was solved and what was not, with reasons; keys are part of the command line."""
+    is_mirror = np.array([row.heliostat is not None for row in result.scenario.receivers], bool)
+    parts = {
+        "poses": (result.poses.status, PoseStatus),
+        "fixes": (result.fixes.status[:, is_mirror], FixStatus),
+        "tones": (result.tones.status, LineStatus),
+    }
+    summary: dict[str, Any] = {
+        "frames": len(result.frame_start_index),
+        "heliostats": len(result.scenario.heliostat_ids),
+        "receivers": len(result.scenario.receiver_ids),
+        "estimator": result.settings["estimator"],
+        "pose": result.settings["pose"],
+    }
+    for name, (status, codes) in parts.items():
+        solved = int(np.count_nonzero(status == 0))
+        summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": reasons(status, codes)}
+    return summary
+
+
+CSV_COLUMNS = (
+    "frame",
+    "time_utc",
+    "heliostat",
+    "azimuth_deg",
+    "elevation_deg",
+    "normal_east",
+    "normal_north",
+    "normal_up",
+    "normal_sigma_mrad",
+    "status",
+)
+
+
+def write_poses_csv(result: Result, path: str | Path) -> None:
+    """Write the mirror normals for people: degrees, milliradians of the normal, one row a frame and heliostat.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    poses = result.poses
+    for i_frame, start in enumerate(result.frame_start_index):
+        time = frame_time(int(start), result.sample_rate).isoformat(timespec="microseconds")
+        for i, heliostat in enumerate(result.scenario.heliostat_ids):
+            row = (i_frame, i)
+            numbers = [
+                f"{np.degrees(poses.azimuth_rad[row]):.6f}",
+                f"{np.degrees(poses.elevation_rad[row]):.6f}",
+                *(f"{value:.9f}" for value in poses.normal_enu[row]),
+                f"{1e3 * poses.sigma_rad[row]:.6f}",
+            ]
+            blank = ["" if number == "nan" else number for number in numbers]
+            status = PoseStatus(int(poses.status[row])).reason
+            writer.writerow([i_frame, time.replace("+00:00", "Z"), heliostat, *blank, status])
+    write_atomically(path, text.getvalue().encode())

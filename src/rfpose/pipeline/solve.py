@@ -1,0 +1,111 @@
+"""From tone phases to mirror normals: calibration, ranges, fixes, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rfpose.dsp import Calibration, TonePhases, calibrate
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.multilat import Fixes, Poses, RangeDifferences, check_unambiguous, range_differences, solve_poses
+from rfpose.multilat.fix import check_transmitters
+from rfpose.pipeline.result_file import FixTable, PoseTable, Result
+from rfpose.scenario import Scenario
+from rfpose.truth import Truth
+
+__all__ = ["POSES", "check_solvable", "solve"]
+
+POSES = ("independent",)
+"""Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's."""
+
+
+def check_solvable(scenario: Scenario, *, pose: str) -> None:
+    """Refuse a site that no recording could be solved for, before any work is done.
+
+    Raises
+    ------
+    InvalidInputError
+        Unknown ``pose``.
+    ScenarioError
+        No heliostat, or no calibration receiver.
+    GeometryError
+        Too few transmitters, on a line or at the same place; or the field is too wide for the longest tone.
+    """
+    if pose not in POSES:
+        raise InvalidInputError(f"`pose` must be one of {', '.join(POSES)}, got {pose!r}")
+    if not scenario.heliostat:
+        raise ScenarioError(f"scenario `{scenario.name}` has no heliostat to measure; add a [[heliostat]]")
+    if not scenario.calibration_receiver:
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no calibration receiver, and pose `{pose}` needs one to learn the "
+            "transmitters' electronic phases; add a [[calibration_receiver]] at a surveyed place"
+        )
+    check_transmitters(scenario.transmitter_enu_m)
+    check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
+
+
+def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str], truth: Truth | None = None) -> Result:
+    """Find receiver positions and mirror normals from tone phases.
+
+    Parameters
+    ----------
+    tones
+        Along the scenario's receiver axis.
+    scenario
+        The site.
+    settings
+        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``.
+    truth
+        Kept with the result.
+
+    Raises
+    ------
+    InvalidInputError, ScenarioError, GeometryError
+        As `check_solvable`. A receiver or mirror that cannot be solved is NaN with a status.
+    """
+    check_solvable(scenario, pose=settings["pose"])
+    calibration = calibrate(tones, scenario)
+    ranges = _ranges(tones, calibration, scenario)
+    poses = solve_poses(
+        scenario.transmitter_enu_m,
+        ranges.range_difference_m,
+        sigma_m=ranges.sigma_m,
+        calibration_sigma_m=ranges.calibration_sigma_m,
+        mirror_rows=[scenario.receiver_rows(i) for i in range(len(scenario.heliostat))],
+        receiver_mirror_m=[heliostat.receiver_mirror_m for heliostat in scenario.heliostat],
+    )
+    n_frame, n_receiver = tones.phase_rad.shape[:2]
+    return Result(
+        scenario=scenario,
+        settings=settings,
+        frame_start_index=tones.frame_start_index,
+        tones=tones,
+        calibration=calibration,
+        ranges=ranges,
+        fixes=_fix_table(poses.fixes, n_frame, n_receiver),
+        poses=_pose_table(poses),
+        truth=truth,
+    )
+
+
+def _ranges(tones: TonePhases, calibration: Calibration, scenario: Scenario) -> RangeDifferences:
+    return range_differences(
+        tones.phase_rad,
+        tones.sigma_rad,
+        calibration.phase_rad[:, None],
+        calibration.sigma_rad[:, None],
+        scenario.wavelength_m,
+        scenario.transmitter_enu_m,
+    )
+
+
+def _fix_table(fixes: Fixes, n_frame: int, n_receiver: int) -> FixTable:
+    """Give the flat rows of `Fixes` their two axes back."""
+    arrays = {name: np.asarray(getattr(fixes, name)) for name in FixTable.__dataclass_fields__}
+    return FixTable(**{name: array.reshape(n_frame, n_receiver, *array.shape[1:]) for name, array in arrays.items()})
+
+
+def _pose_table(poses: Poses) -> PoseTable:
+    names = [name for name in PoseTable.__dataclass_fields__ if name != "centre_enu_m"]
+    return PoseTable(**{name: getattr(poses.normals, name) for name in names}, centre_enu_m=poses.centre_enu_m)
