@@ -21,14 +21,14 @@ from rfpose.truth import Truth
 
 __all__ = [
     "COMPONENT_DTYPE",
-    "COMPOUND_DTYPE",
     "FILL_VALUE",
+    "STORED_DTYPE",
     "GapError",
     "IqArray",
     "Recording",
     "RecordingFormat",
     "SampleFormat",
-    "as_compound",
+    "as_stored",
     "count_fill",
     "frame_starts",
     "recorded_runs",
@@ -46,8 +46,9 @@ COMPONENT_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
     "int16": np.dtype("<i2"),
     "complex64": np.dtype("<f4"),
 }
-COMPOUND_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
-    name: np.dtype([(keys.REAL, component), (keys.IMAG, component)]) for name, component in COMPONENT_DTYPE.items()
+STORED_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
+    "int16": np.dtype([(keys.REAL, "<i2"), (keys.IMAG, "<i2")]),
+    "complex64": np.dtype("<c8"),  # h5py's name for the compound of float32 r and i
 }
 FILL_VALUE: Final[Mapping[str, float]] = {"int16": -(2**15), "complex64": float("nan")}
 """What stands in I and in Q where a file has room for a sample that was never written; Digital RF's choice too."""
@@ -57,9 +58,9 @@ class GapError(RecordingError):
     """Samples were asked for that the receiver did not record."""
 
 
-def as_compound(iq: IqArray, sample_format: str) -> npt.NDArray[Any]:
-    """Return a (sample,) view of ``iq`` (sample, 2) with fields ``r`` and ``i``; no copy is made."""
-    return iq.view(COMPOUND_DTYPE[sample_format]).reshape(-1)
+def as_stored(iq: IqArray, sample_format: str) -> npt.NDArray[Any]:
+    """Return a (sample,) view of ``iq`` (sample, 2) of the type that files hold; no copy is made."""
+    return iq.view(STORED_DTYPE[sample_format]).reshape(-1)
 
 
 def count_fill(iq: IqArray) -> int:

@@ -74,6 +74,7 @@ def convert(
     target = Path(target_path)
     if target.exists() and target.resolve() == source.path.resolve():
         raise RecordingError(f"{target}: source and target are the same; choose another name")
+    _refuse_small_disk(source, target)
     if format == "rfpose-iq":
         _to_native(source, target, overwrite, on_progress)
         return
@@ -87,7 +88,7 @@ def convert(
 
 def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -> Iterator[tuple[str, int, IqArray]]:
     """Yield (receiver, start index, samples) of everything recorded, receiver by receiver; the buffer is reused."""
-    total = sum(int(source.blocks(name)[:, 1].sum()) for name in source.receiver_ids)
+    total = _total_samples(source)
     buffer = np.empty((_PIECE_SAMPLES, 2), source.component_dtype)
     done = 0
     for receiver_id in source.receiver_ids:
@@ -98,6 +99,23 @@ def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -
                 done += take
                 if on_progress is not None:
                     on_progress(done, total)
+
+
+def _refuse_small_disk(source: Recording, target: Path) -> None:
+    """Raise before anything is written if the disk cannot hold it; Digital RF's library dies noisily of that."""
+    if not target.parent.is_dir():
+        raise RecordingError(f"{target}: the directory `{target.parent}` does not exist; make it first")
+    n_byte = _total_samples(source) * 2 * source.component_dtype.itemsize
+    free = shutil.disk_usage(target.parent).free
+    if free < n_byte:
+        raise RecordingError(
+            f"{target}: needs {n_byte / 1e9:.3g} GB, the disk has {free / 1e9:.3g} GB free; free space on it, or write "
+            "elsewhere"
+        )
+
+
+def _total_samples(source: Recording) -> int:
+    return sum(int(source.blocks(name)[:, 1].sum()) for name in source.receiver_ids)
 
 
 def _to_native(
@@ -233,6 +251,9 @@ def _to_directory(
     if stream is None:
         raise RecordingError(f"{source.path}: no samples to convert; check it with `rfpose info`")
     stream.finish()
+    for receiver_id in source.receiver_ids:
+        if not len(source.blocks(receiver_id)):
+            _log.warning("%s: receiver `%s` recorded nothing and is left out", source.path, receiver_id)
     if source.scenario is not None:
         (directory / SCENARIO_FILE).write_text(source.scenario.to_toml(), encoding="utf-8")
 

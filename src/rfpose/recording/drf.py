@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 CENTRE_FREQUENCIES = "center_frequencies"
 """Field of a channel's Digital Metadata under which its own recorder, thor, notes the tuning, one a subchannel."""
 
+_CACHE_BYTES = 2**28
+"""Over all channels. A compressed file is inflated chunk by chunk, and a chunk may hold many frames."""
 # H5Tget_class, bytes a component
 _SAMPLE_FORMATS: dict[tuple[int, int], SampleFormat] = {(0, 2): "int16", (1, 4): "complex64"}
 
@@ -50,7 +52,8 @@ class DigitalRfRecording(Recording):
         library = import_digital_rf()
         self._path = path
         with self._library_errors("drf_properties.h5"):
-            self._reader = library.DigitalRFReader(str(path))
+            n_channel = sum(1 for _ in path.glob("*/drf_properties.h5"))
+            self._reader = library.DigitalRFReader(str(path), rdcc_nbytes=_CACHE_BYTES // n_channel)
             properties = {name: self._reader.get_properties(name) for name in self._reader.get_channels()}
         first = next(iter(properties))
         sample_format = self._checked_format(first, properties[first])
@@ -128,8 +131,8 @@ class DigitalRfRecording(Recording):
         for start, piece in pieces.items():
             if start != first + done:
                 break
-            out[done : done + len(piece), 0] = piece["r"]
-            out[done : done + len(piece), 1] = piece["i"]
+            component = piece.dtype["r"] if piece.dtype.names else piece.real.dtype
+            out[done : done + len(piece)] = piece.view(component).reshape(-1, 2)
             done += len(piece)
         if done != len(out):
             raise RecordingError(

@@ -12,7 +12,7 @@ import numpy as np
 
 from rfpose.errors import RecordingError, RfposeError
 from rfpose.recording import keys
-from rfpose.recording.base import COMPOUND_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_compound
+from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
 from rfpose.scenario import Scenario, parse_scenario
 from rfpose.truth import Truth
 
@@ -40,7 +40,7 @@ class NativeRecording(Recording):
             fields = _Fields(path, self._file)
             fields.check_format()
             sample_format = fields.text(keys.SAMPLE_FORMAT)
-            if sample_format not in COMPOUND_DTYPE:
+            if sample_format not in STORED_DTYPE:
                 raise fields.error(keys.SAMPLE_FORMAT, f"must be int16 or complex64, is {sample_format!r}")
             numerator, denominator = fields.integer(keys.RATE_NUMERATOR), fields.integer(keys.RATE_DENOMINATOR)
             if numerator < 1 or denominator < 1:
@@ -62,7 +62,7 @@ class NativeRecording(Recording):
             if not self.receiver_ids:
                 raise RecordingError(f"{path}: `/{keys.RECEIVERS}` holds no receiver; {_REMEDY}")
             for receiver_id in self.receiver_ids:
-                self._iq[receiver_id] = fields.iq(receiver_id, COMPOUND_DTYPE[sample_format])
+                self._iq[receiver_id] = fields.iq(receiver_id, STORED_DTYPE[sample_format])
             self._fields = fields
             self._offsets: dict[str, IndexArray] = {}
         except BaseException as error:
@@ -82,7 +82,7 @@ class NativeRecording(Recording):
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         first = int(self._offsets[receiver_id][i_segment]) + skip
-        target = as_compound(out, self.sample_format)
+        target = as_stored(out, self.sample_format)
         try:
             # the buffer has the file's own compound type, so HDF5 copies bytes and converts nothing
             self._iq[receiver_id].read_direct(target, np.s_[first : first + len(target)])

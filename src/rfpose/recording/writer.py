@@ -19,11 +19,11 @@ from rfpose.errors import InvalidInputError
 from rfpose.recording import keys
 from rfpose.recording.base import (
     COMPONENT_DTYPE,
-    COMPOUND_DTYPE,
     FILL_VALUE,
+    STORED_DTYPE,
     IqArray,
     SampleFormat,
-    as_compound,
+    as_stored,
 )
 from rfpose.recording.output import Hdf5Output, refuse_existing
 from rfpose.scenario import Scenario
@@ -178,7 +178,7 @@ class RecordingWriter:
         with output.writing():
             dataset.resize((offset + len(samples),))
             dataset.write_direct(
-                as_compound(np.ascontiguousarray(samples), self._sample_format),
+                as_stored(np.ascontiguousarray(samples), self._sample_format),
                 dest_sel=np.s_[offset : offset + len(samples)],
             )
         if blocks and start_index == reached:
@@ -196,7 +196,8 @@ class RecordingWriter:
                 if field.name.endswith("_ids"):
                     group.create_dataset(field.name, data=list(value), dtype=h5py.string_dtype(), shape=(len(value),))
                 elif value is not None:
-                    group.create_dataset(field.name, data=value)
+                    dtype = np.int64 if field.name == "frame_start_index" else np.float64
+                    group.create_dataset(field.name, data=np.asarray(value, dtype))
 
     # -- the file ----------------------------------------------------------------------------------------
 
@@ -216,17 +217,22 @@ class RecordingWriter:
             provenance.attrs[name] = self._provenance[name]
         if self._scenario is not None:
             file.create_dataset(keys.SCENARIO, data=self._scenario.to_toml(), dtype=h5py.string_dtype())
-        dtype = COMPOUND_DTYPE[self._sample_format]
-        fill = np.array((FILL_VALUE[self._sample_format],) * 2, dtype)
+        form = self._sample_format
+        fill = as_stored(np.full((1, 2), FILL_VALUE[form], COMPONENT_DTYPE[form]), form)[0]
         receivers = file.create_group(keys.RECEIVERS, track_order=True)
         for receiver_id in self._receiver_ids:
             self._iq[receiver_id] = receivers.create_group(receiver_id).create_dataset(
-                keys.IQ, shape=(0,), maxshape=(None,), chunks=(self._chunk_samples(),), dtype=dtype, fillvalue=fill
+                keys.IQ,
+                shape=(0,),
+                maxshape=(None,),
+                chunks=(self._chunk_samples(),),
+                dtype=STORED_DTYPE[form],
+                fillvalue=fill,
             )
 
     def _chunk_samples(self) -> int:
         """Return the length of a chunk: up to 1 MiB, and a whole number of them a frame, so that frames align."""
-        largest = _CHUNK_BYTES // COMPOUND_DTYPE[self._sample_format].itemsize
+        largest = _CHUNK_BYTES // STORED_DTYPE[self._sample_format].itemsize
         if self._scenario is None:
             return largest
         frame = self._scenario.radio.frame_samples
