@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -85,13 +86,15 @@ class Simulator:
         "int16" or "complex64" (as pairs of float32).
     full_scale
         Largest value of a component: 2^(bits−1)−1 counts, at which the converter saturates; for complex64, which
-        is not converted, the largest float32.
+        is not converted, infinity.
     counts_per_unit
         Sample value that a transmitter of amplitude one gives at the reference range.
     noise_sigma
         Standard deviation of one component of the noise, in units of a transmitter of amplitude one.
     total_samples
         Over all receivers and frames, lost ones not counted.
+    draws : Draws
+        What chance decided, that which ``truth`` does not hold included.
 
     Raises
     ------
@@ -110,6 +113,7 @@ class Simulator:
     counts_per_unit: float
     noise_sigma: float
     total_samples: int
+    draws: _draws.Draws
 
     def __init__(self, scenario: Scenario, *, seed: int) -> None:
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
@@ -128,7 +132,7 @@ class Simulator:
         self.total_samples = self._count_samples()
 
         since_start = self.frame_start_index - self.frame_start_index[0]
-        self._draws = _draws.draw(
+        self.draws = _draws.draw(
             scenario, seed=self._seed, frame_time_s=since_start / float(scenario.radio.sample_rate)
         )
         normal_enu = _motion.mirror_normal_enu(scenario)
@@ -143,7 +147,7 @@ class Simulator:
             self.counts_per_unit = self.full_scale / (peak * 10.0 ** (simulation.headroom_db / 20.0))
             rounding_variance = 1.0 / (12.0 * self.counts_per_unit**2)
         else:
-            self.full_scale = float(np.finfo(np.float32).max)
+            self.full_scale = math.inf
             self.counts_per_unit = 1.0
             rounding_variance = 0.0
         noise_variance = 2.0 * (self.noise_sigma**2 + rounding_variance)
@@ -155,9 +159,9 @@ class Simulator:
             normal_enu=read_only(normal_enu),
             receiver_enu_m=read_only(self._receiver_enu_m),
             frame_start_index=self.frame_start_index,
-            transmitter_phase_rad=read_only(self._draws.tone_phase_rad),
-            clock_ppm=read_only(self._draws.clock_ppm),
-            receiver_delay_s=read_only(self._draws.delay_s),
+            transmitter_phase_rad=read_only(self.draws.tone_phase_rad),
+            clock_ppm=read_only(self.draws.clock_ppm),
+            receiver_delay_s=read_only(self.draws.delay_s),
             tone_snr=read_only((amplitude[..., None] * index) ** 2 / noise_variance),
         )
 
@@ -188,7 +192,7 @@ class Simulator:
                         yield _Job(i_frame, i_receiver, i_chunk, rays, kept)
 
     def _rays_of(self, i_frame: int, i_receiver: int, range_m: FloatArray) -> _rays.Rays:
-        draws = self._draws
+        draws = self.draws
         run_start_index = int(self._run_start_index[i_frame])
         return _rays.make_rays(
             self._scenario,
