@@ -2,8 +2,9 @@
 
 Receivers are taken in groups of `LANES`. A group's state lies in one flat workspace, quantity after quantity,
 each `LANES` long, so that every loop over lanes runs over adjacent numbers at constant offsets and becomes
-vector instructions. Lengths inside are in units of the transmitters' extent about their centroid: `scale` and
-`centre` lead back to metres.
+vector instructions. (An offset that is not constant would not: numba then tests each index for being negative,
+which is why what belongs to one transmitter is a row of a two-dimensional array.) Lengths inside are in units of
+the transmitters' extent about their centroid: `scale` and `centre` lead back to metres.
 
 Symbols as in Swart et al. §3.4: unknowns (x, y, z, d_r), residual ε = |R − T| − d_r − Δ, Jacobian row
 (u, −1) with u = (R − T)/|R − T|. The clock d_r is eliminated first (its pivot is the sum of the weights), which
@@ -34,45 +35,26 @@ SINGULAR = 3
 NOT_CONVERGED = 4
 
 # offsets of the quantities in the workspace
-X = 0 * LANES
-Y = 1 * LANES
-Z = 2 * LANES
-C = 3 * LANES
-AXX = 4 * LANES
-AXY = 5 * LANES
-AXZ = 6 * LANES
-AYY = 7 * LANES
-AYZ = 8 * LANES
-AZZ = 9 * LANES
-BX = 10 * LANES
-BY = 11 * LANES
-BZ = 12 * LANES
-GX = 13 * LANES
-GY = 14 * LANES
-GZ = 15 * LANES
-GC = 16 * LANES
-W = 17 * LANES
-DD = 18 * LANES
-PX = 19 * LANES
-PY = 20 * LANES
-PZ = 21 * LANES
-RD = 22 * LANES
-ACTIVE = 23 * LANES
-BAD = 24 * LANES
-CHI2 = 25 * LANES
-ITERATIONS = 26 * LANES
-SEEN = 27 * LANES
-QXX = 28 * LANES
-QXY = 29 * LANES
-QXZ = 30 * LANES
-QYY = 31 * LANES
-QYZ = 32 * LANES
-QZZ = 33 * LANES
-DOP2 = 34 * LANES
-WORKSPACE = 35 * LANES
-
-FIRST_SUM = AXX
-LAST_SUM = W
+X, Y, Z, C = 0 * LANES, 1 * LANES, 2 * LANES, 3 * LANES
+# sums over transmitters: weights, JᵀWJ without the clock, its clock column, JᵀWε
+W = 4 * LANES
+AXX, AXY, AXZ = 5 * LANES, 6 * LANES, 7 * LANES
+AYY, AYZ, AZZ = 8 * LANES, 9 * LANES, 10 * LANES
+BX, BY, BZ = 11 * LANES, 12 * LANES, 13 * LANES
+GX, GY, GZ, GC = 14 * LANES, 15 * LANES, 16 * LANES, 17 * LANES
+FIRST_SUM, LAST_SUM = W, GC
+# more sums, for the linear equations only
+BD, BS, DD = 18 * LANES, 19 * LANES, 20 * LANES
+PX, PY, PZ = 21 * LANES, 22 * LANES, 23 * LANES
+LAST_MOMENT = PZ
+# inverse of M
+QXX, QXY, QXZ = 24 * LANES, 25 * LANES, 26 * LANES
+QYY, QYZ, QZZ = 27 * LANES, 28 * LANES, 29 * LANES
+# bookkeeping
+ACTIVE, BAD, SEEN = 30 * LANES, 31 * LANES, 32 * LANES
+ITERATIONS, LAST_STEP2 = 33 * LANES, 34 * LANES
+CHI2, DOP2 = 35 * LANES, 36 * LANES
+WORKSPACE = 37 * LANES
 
 TINY = 1e-30
 # det(M) against the cube of its mean eigenvalue, below which M counts as singular
@@ -94,57 +76,61 @@ def load_group(
     n_transmitter = range_difference.shape[1]
     shared = weight.shape[0] == 1
     for lane in range(LANES):
-        ws[SEEN + lane] = 0.0
-        ws[W + lane] = 0.0
-    for lane in range(LANES):
         row = first + min(lane, n_lane - 1)
         row_w = 0 if shared else row
         seen = 0.0
         for t in range(n_transmitter):
             value = range_difference[row, t]
             q = weight[row_w, t]
-            if abs(value) < np.inf and q > 0.0:
-                delta[t * LANES + lane] = value * inverse_scale
-                w[t * LANES + lane] = q
-                seen += 1.0
-            else:
-                delta[t * LANES + lane] = 0.0
-                w[t * LANES + lane] = 0.0
+            received = abs(value) < np.inf and q > 0.0
+            delta[t, lane] = value * inverse_scale if received else 0.0
+            w[t, lane] = q if received else 0.0
+            seen += 1.0 if received else 0.0
         ws[SEEN + lane] = seen
 
 
 @kernel_fast
-def _moments(tx: float, ty: float, tz: float, k: int, delta: FloatArray, w: FloatArray, ws: FloatArray) -> None:
-    """Add one transmitter to the moments of the linear equations (see `start_group`)."""
-    t2 = tx * tx + ty * ty + tz * tz
+def _moments(transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray) -> None:
+    """Add transmitters ``t`` and ``t + 1`` to the moments of the linear equations (see `start_group`)."""
+    ax, ay, az = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
+    bx, by, bz = transmitter[t + 1, 0], transmitter[t + 1, 1], transmitter[t + 1, 2]
+    a2 = ax * ax + ay * ay + az * az
+    b2 = bx * bx + by * by + bz * bz
     for lane in range(LANES):
-        d = delta[k + lane]
-        q = w[k + lane]
-        b = 0.5 * (t2 - d * d)
-        qx = q * tx
-        qy = q * ty
-        qz = q * tz
-        qd = q * d
-        ws[W + lane] += q
-        ws[BX + lane] += qx
-        ws[BY + lane] += qy
-        ws[BZ + lane] += qz
-        ws[RD + lane] += qd
-        ws[CHI2 + lane] += q * b
-        ws[AXX + lane] += qx * tx
-        ws[AXY + lane] += qx * ty
-        ws[AXZ + lane] += qx * tz
-        ws[AYY + lane] += qy * ty
-        ws[AYZ + lane] += qy * tz
-        ws[AZZ + lane] += qz * tz
-        ws[PX + lane] += qx * d
-        ws[PY + lane] += qy * d
-        ws[PZ + lane] += qz * d
-        ws[DD + lane] += qd * d
-        ws[GX + lane] += qx * b
-        ws[GY + lane] += qy * b
-        ws[GZ + lane] += qz * b
-        ws[GC + lane] += qd * b
+        da = delta[t, lane]
+        db = delta[t + 1, lane]
+        qa = w[t, lane]
+        qb = w[t + 1, lane]
+        sa = 0.5 * (a2 - da * da)
+        sb = 0.5 * (b2 - db * db)
+        qax = qa * ax
+        qay = qa * ay
+        qaz = qa * az
+        qad = qa * da
+        qbx = qb * bx
+        qby = qb * by
+        qbz = qb * bz
+        qbd = qb * db
+        ws[W + lane] += qa + qb
+        ws[BX + lane] += qax + qbx
+        ws[BY + lane] += qay + qby
+        ws[BZ + lane] += qaz + qbz
+        ws[BD + lane] += qad + qbd
+        ws[BS + lane] += qa * sa + qb * sb
+        ws[AXX + lane] += qax * ax + qbx * bx
+        ws[AXY + lane] += qax * ay + qbx * by
+        ws[AXZ + lane] += qax * az + qbx * bz
+        ws[AYY + lane] += qay * ay + qby * by
+        ws[AYZ + lane] += qay * az + qby * bz
+        ws[AZZ + lane] += qaz * az + qbz * bz
+        ws[PX + lane] += qax * da + qbx * db
+        ws[PY + lane] += qay * da + qby * db
+        ws[PZ + lane] += qaz * da + qbz * db
+        ws[DD + lane] += qad * da + qbd * db
+        ws[GX + lane] += qax * sa + qbx * sb
+        ws[GY + lane] += qay * sa + qby * sb
+        ws[GZ + lane] += qaz * sa + qbz * sb
+        ws[GC + lane] += qad * sa + qbd * sb
 
 
 @kernel_fast
@@ -155,8 +141,8 @@ def _solve_linear(planar: float, ws: FloatArray) -> None:
         mx = ws[BX + lane] * iw
         my = ws[BY + lane] * iw
         mz = ws[BZ + lane] * iw
-        md = ws[RD + lane] * iw
-        sb = ws[CHI2 + lane]
+        md = ws[BD + lane] * iw
+        sb = ws[BS + lane]
         axx = ws[AXX + lane] - mx * ws[BX + lane]
         axy = ws[AXY + lane] - mx * ws[BY + lane]
         axz = ws[AXZ + lane] - mx * ws[BZ + lane]
@@ -166,7 +152,7 @@ def _solve_linear(planar: float, ws: FloatArray) -> None:
         px = ws[PX + lane] - md * ws[BX + lane]
         py = ws[PY + lane] - md * ws[BY + lane]
         pz = ws[PZ + lane] - md * ws[BZ + lane]
-        dd = ws[DD + lane] - md * ws[RD + lane]
+        dd = ws[DD + lane] - md * ws[BD + lane]
         gx = ws[GX + lane] - mx * sb
         gy = ws[GY + lane] - my * sb
         gz = ws[GZ + lane] - mz * sb
@@ -195,12 +181,10 @@ def _solve_linear(planar: float, ws: FloatArray) -> None:
 @kernel
 def start_group(transmitter: FloatArray, delta: FloatArray, w: FloatArray, planar: float, ws: FloatArray) -> None:
     """Start from the linear equations: T·R + Δ d_r − ½(|R|² − d_r²) = ½(|T|² − Δ²), five unknowns."""
-    for k in range(FIRST_SUM, ACTIVE):
+    for k in range(FIRST_SUM, LAST_MOMENT + LANES):
         ws[k] = 0.0
-    for lane in range(LANES):
-        ws[CHI2 + lane] = 0.0
-    for t in range(transmitter.shape[0]):
-        _moments(transmitter[t, 0], transmitter[t, 1], transmitter[t, 2], t * LANES, delta, w, ws)
+    for t in range(0, transmitter.shape[0], 2):
+        _moments(transmitter, t, delta, w, ws)
     _solve_linear(planar, ws)
 
 
@@ -227,45 +211,62 @@ def start_given(
             dx = start[row, 0] - transmitter[t, 0]
             dy = start[row, 1] - transmitter[t, 1]
             dz = start[row, 2] - transmitter[t, 2]
-            q = w[t * LANES + lane]
-            total += q * (math.sqrt(dx * dx + dy * dy + dz * dz) - delta[t * LANES + lane])
+            q = w[t, lane]
+            total += q * (math.sqrt(dx * dx + dy * dy + dz * dz) - delta[t, lane])
             q_total += q
         ws[C + lane] = total / q_total
 
 
 @kernel_fast
-def _normal_equations(
-    tx: float, ty: float, tz: float, k: int, delta: FloatArray, w: FloatArray, ws: FloatArray
-) -> None:
-    """Add one transmitter to JᵀWJ and JᵀWε."""
+def _normal_equations(transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray) -> None:
+    """Add transmitters ``t`` and ``t + 1`` to JᵀWJ and JᵀWε. Two at a time halve the traffic of the sums."""
+    ax, ay, az = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
+    bx, by, bz = transmitter[t + 1, 0], transmitter[t + 1, 1], transmitter[t + 1, 2]
     for lane in range(LANES):
-        dx = ws[X + lane] - tx
-        dy = ws[Y + lane] - ty
-        dz = ws[Z + lane] - tz
-        d2 = dx * dx + dy * dy + dz * dz + TINY
-        inverse = 1.0 / math.sqrt(d2)
-        q = w[k + lane]
-        error = d2 * inverse - ws[C + lane] - delta[k + lane]
-        ux = dx * inverse
-        uy = dy * inverse
-        uz = dz * inverse
-        qx = q * ux
-        qy = q * uy
-        qz = q * uz
-        ws[AXX + lane] += qx * ux
-        ws[AXY + lane] += qx * uy
-        ws[AXZ + lane] += qx * uz
-        ws[AYY + lane] += qy * uy
-        ws[AYZ + lane] += qy * uz
-        ws[AZZ + lane] += qz * uz
-        ws[BX + lane] += qx
-        ws[BY + lane] += qy
-        ws[BZ + lane] += qz
-        ws[GX + lane] += qx * error
-        ws[GY + lane] += qy * error
-        ws[GZ + lane] += qz * error
-        ws[GC + lane] += q * error
-        ws[W + lane] += q
+        x = ws[X + lane]
+        y = ws[Y + lane]
+        z = ws[Z + lane]
+        clock = ws[C + lane]
+        ux = x - ax
+        uy = y - ay
+        uz = z - az
+        vx = x - bx
+        vy = y - by
+        vz = z - bz
+        u2 = ux * ux + uy * uy + uz * uz + TINY
+        v2 = vx * vx + vy * vy + vz * vz + TINY
+        iu = 1.0 / math.sqrt(u2)
+        iv = 1.0 / math.sqrt(v2)
+        qu = w[t, lane]
+        qv = w[t + 1, lane]
+        eu = u2 * iu - clock - delta[t, lane]
+        ev = v2 * iv - clock - delta[t + 1, lane]
+        ux *= iu
+        uy *= iu
+        uz *= iu
+        vx *= iv
+        vy *= iv
+        vz *= iv
+        qux = qu * ux
+        quy = qu * uy
+        quz = qu * uz
+        qvx = qv * vx
+        qvy = qv * vy
+        qvz = qv * vz
+        ws[AXX + lane] += qux * ux + qvx * vx
+        ws[AXY + lane] += qux * uy + qvx * vy
+        ws[AXZ + lane] += qux * uz + qvx * vz
+        ws[AYY + lane] += quy * uy + qvy * vy
+        ws[AYZ + lane] += quy * uz + qvy * vz
+        ws[AZZ + lane] += quz * uz + qvz * vz
+        ws[BX + lane] += qux + qvx
+        ws[BY + lane] += quy + qvy
+        ws[BZ + lane] += quz + qvz
+        ws[GX + lane] += qux * eu + qvx * ev
+        ws[GY + lane] += quy * eu + qvy * ev
+        ws[GZ + lane] += quz * eu + qvz * ev
+        ws[GC + lane] += qu * eu + qv * ev
+        ws[W + lane] += qu + qv
 
 
 @kernel_fast
@@ -302,8 +303,9 @@ def _invert(planar: float, ws: FloatArray) -> None:
 def _step(tolerance2: float, ws: FloatArray) -> float:
     """Take each active lane's Gauss-Newton step and return how many lanes are still on their way.
 
-    A step longer than the transmitters' extent is shortened to it. A lane has arrived when its step is below
-    the tolerance in standard deviations, or below what float64 resolves.
+    A step longer than the transmitters' extent is shortened to it. A lane has arrived when its next step, foretold
+    from the last two as of a sequence that converges linearly (near the solution it does better), is below the
+    tolerance in standard deviations, or when this one was below what float64 resolves.
     """
     for lane in range(LANES):
         iw = 1.0 / (ws[W + lane] + TINY)
@@ -326,7 +328,8 @@ def _step(tolerance2: float, ws: FloatArray) -> float:
         # the clock that fits best after the step: linear in the step, not shortened with it
         ws[C + lane] += ws[ACTIVE + lane] * ((gc + shorten * (bx * sx + by * sy + bz * sz)) * iw)
         ws[ITERATIONS + lane] += ws[ACTIVE + lane]
-        arrived = in_sigma2 < tolerance2 or length2 < 1e-24
+        arrived = in_sigma2 * in_sigma2 < tolerance2 * ws[LAST_STEP2 + lane] or length2 < 1e-28
+        ws[LAST_STEP2 + lane] = in_sigma2
         ws[ACTIVE + lane] = 0.0 if arrived or ws[BAD + lane] > 0.0 else ws[ACTIVE + lane]
     active = 0.0
     for lane in range(LANES):
@@ -339,8 +342,8 @@ def _linearise(transmitter: FloatArray, delta: FloatArray, w: FloatArray, ws: Fl
     """Form the normal equations of all lanes at their present position."""
     for k in range(FIRST_SUM, LAST_SUM + LANES):
         ws[k] = 0.0
-    for t in range(transmitter.shape[0]):
-        _normal_equations(transmitter[t, 0], transmitter[t, 1], transmitter[t, 2], t * LANES, delta, w, ws)
+    for t in range(0, transmitter.shape[0], 2):
+        _normal_equations(transmitter, t, delta, w, ws)
 
 
 @kernel
@@ -358,6 +361,7 @@ def iterate_group(
     for lane in range(LANES):
         ws[ACTIVE + lane] = 1.0 if ws[SEEN + lane] >= n_min else 0.0
         ws[ITERATIONS + lane] = 0.0
+        ws[LAST_STEP2 + lane] = 0.0
     for _ in range(max_iteration):
         _linearise(transmitter, delta, w, ws)
         _invert(planar, ws)
@@ -367,48 +371,74 @@ def iterate_group(
 
 @kernel_fast
 def _residuals(
-    tx: float, ty: float, tz: float, k: int, delta: FloatArray, w: FloatArray, ws: FloatArray, residual: FloatArray
+    transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray, residual: FloatArray
 ) -> None:
     """One transmitter's residuals, and their share of chi-squared."""
+    tx, ty, tz = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
     for lane in range(LANES):
         dx = ws[X + lane] - tx
         dy = ws[Y + lane] - ty
         dz = ws[Z + lane] - tz
-        error = math.sqrt(dx * dx + dy * dy + dz * dz) - ws[C + lane] - delta[k + lane]
-        residual[k + lane] = error
-        ws[CHI2 + lane] += w[k + lane] * error * error
+        error = math.sqrt(dx * dx + dy * dy + dz * dz) - ws[C + lane] - delta[t, lane]
+        residual[t, lane] = error
+        ws[CHI2 + lane] += w[t, lane] * error * error
+
+
+@kernel_fast
+def _unequal(n_transmitter: int, w: FloatArray, ws: FloatArray) -> float:
+    """Count lanes whose received transmitters differ in weight; each lane's largest weight goes to DOP2."""
+    for lane in range(LANES):
+        ws[DOP2 + lane] = 0.0
+        ws[DD + lane] = 1e300
+    for t in range(n_transmitter):
+        for lane in range(LANES):
+            q = w[t, lane]
+            largest = ws[DOP2 + lane]
+            smallest = ws[DD + lane]
+            received = q if q > 0.0 else 1e300
+            ws[DOP2 + lane] = q if q > largest else largest
+            ws[DD + lane] = received if received < smallest else smallest
+    count = 0.0
+    for lane in range(LANES):
+        count += 1.0 if ws[DOP2 + lane] > ws[DD + lane] else 0.0
+    return count
 
 
 @kernel
-def _dop_group(
+def dop_group(
     transmitter: FloatArray, delta: FloatArray, w: FloatArray, planar: float, even: FloatArray, ws: FloatArray
 ) -> None:
     """Squared position DOP: as if every transmitter that was received had the same weight."""
-    n_transmitter = transmitter.shape[0]
-    for lane in range(LANES):
-        largest = 0.0
-        smallest = np.inf
-        for t in range(n_transmitter):
-            q = w[t * LANES + lane]
-            largest = max(largest, q)
-            smallest = min(smallest, q if q > 0.0 else np.inf)
-            even[t * LANES + lane] = 1.0 if q > 0.0 else 0.0
-        ws[DD + lane] = largest
-        ws[RD + lane] = smallest
-    equal = True
-    for lane in range(LANES):
-        equal = equal and ws[DD + lane] == ws[RD + lane]
-        ws[DOP2 + lane] = (ws[QXX + lane] + ws[QYY + lane] + (1.0 - planar) * ws[QZZ + lane]) * ws[DD + lane]
-    if equal:
+    height = 1.0 - planar
+    if _unequal(transmitter.shape[0], w, ws) == 0.0:
+        for lane in range(LANES):
+            ws[DOP2 + lane] *= ws[QXX + lane] + ws[QYY + lane] + height * ws[QZZ + lane]
         return
-    keep = ws[QXX : QZZ + LANES].copy()
-    bad = ws[BAD : BAD + LANES].copy()
+    keep = ws[QXX : BAD + LANES].copy()
+    for t in range(w.shape[0]):
+        for lane in range(LANES):
+            even[t, lane] = 1.0 if w[t, lane] > 0.0 else 0.0
     _linearise(transmitter, delta, even, ws)
     _invert(planar, ws)
     for lane in range(LANES):
-        ws[DOP2 + lane] = ws[QXX + lane] + ws[QYY + lane] + (1.0 - planar) * ws[QZZ + lane]
-    ws[QXX : QZZ + LANES] = keep
-    ws[BAD : BAD + LANES] = bad
+        ws[DOP2 + lane] = ws[QXX + lane] + ws[QYY + lane] + height * ws[QZZ + lane]
+    ws[QXX : BAD + LANES] = keep
+
+
+@kernel
+def residual_group(
+    n_transmitter: int,
+    transmitter: FloatArray,
+    delta: FloatArray,
+    w: FloatArray,
+    ws: FloatArray,
+    residual: FloatArray,
+) -> None:
+    """Residuals and chi-squared at the solution."""
+    for lane in range(LANES):
+        ws[CHI2 + lane] = 0.0
+    for t in range(n_transmitter):
+        _residuals(transmitter, t, delta, w, ws, residual)
 
 
 @kernel
@@ -476,7 +506,7 @@ def store_group(
         dop[i] = math.sqrt(ws[DOP2 + lane])
         chi2[i] = ws[CHI2 + lane]
         for t in range(n_transmitter):
-            residual[i, t] = error[t * LANES + lane] * scale if w[t * LANES + lane] > 0.0 else np.nan
+            residual[i, t] = error[t, lane] * scale if w[t, lane] > 0.0 else np.nan
 
 
 @kernel_parallel
@@ -504,18 +534,19 @@ def locate_rows(
 ) -> None:
     """Locate every row of ``range_difference``.
 
-    ``transmitter`` and ``start`` are centred and scaled; ``range_difference`` is in metres; ``weight`` is
-    (scale/σ)², one row for all or one a row. An empty ``start`` means the linear equations. ``planar`` is 1
-    for two dimensions (all z are zero), else 0.
+    ``transmitter`` and ``start`` are centred and scaled; ``transmitter`` has an even number of rows, the last of
+    which may be beyond the columns of ``range_difference`` and then has no weight. ``range_difference`` is in
+    metres; ``weight`` is (scale/σ)², one row for all or one a row. An empty ``start`` means the linear equations.
+    ``planar`` is 1 for two dimensions (all z are zero), else 0.
     """
     n = range_difference.shape[0]
     n_transmitter = transmitter.shape[0]
     n_group = (n + LANES - 1) // LANES
     for chunk in numba.prange(n_chunk):
         ws = np.zeros(WORKSPACE)
-        delta = np.empty(n_transmitter * LANES)
-        w = np.empty(n_transmitter * LANES)
-        error = np.empty(n_transmitter * LANES)
+        delta = np.zeros((n_transmitter, LANES))
+        w = np.zeros((n_transmitter, LANES))
+        error = np.empty((n_transmitter, LANES))
         for group in range(n_group * chunk // n_chunk, n_group * (chunk + 1) // n_chunk):
             first = group * LANES
             n_lane = min(LANES, n - first)
@@ -525,11 +556,8 @@ def locate_rows(
             else:
                 start_given(start, first, n_lane, n_transmitter, delta, w, transmitter, ws)
             iterate_group(transmitter, delta, w, planar, max_iteration, tolerance2, n_min, ws)
-            _dop_group(transmitter, delta, w, planar, error, ws)
-            for lane in range(LANES):
-                ws[CHI2 + lane] = 0.0
-            for t in range(n_transmitter):
-                _residuals(transmitter[t, 0], transmitter[t, 1], transmitter[t, 2], t * LANES, delta, w, ws, error)
+            dop_group(transmitter, delta, w, planar, error, ws)
+            residual_group(range_difference.shape[1], transmitter, delta, w, ws, error)
             store_group(
                 first, n_lane, scale, centre, planar, w, error, n_min, ws,
                 position, clock, cov, dop, residual, chi2, n_seen, n_iteration, fate,

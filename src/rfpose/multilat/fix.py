@@ -257,8 +257,9 @@ class _Problem:
             "n_iteration": np.empty(n, np.int16),
             "status": np.empty(n, np.int8),
         }
+        even = np.concatenate([self.inside(self.transmitter), np.zeros((n_transmitter % 2, 3))])
         _kernels.locate_rows(
-            self.inside(self.transmitter), ranges, weight,
+            even, ranges, weight,
             np.empty((0, 3)) if start is None else self.inside(start),
             self.scale, self.centre, 3.0 - n_axis, self.max_iteration, STEP_TOLERANCE_SIGMA**2, n_axis + 2,
             max(1, min(8 * (os.cpu_count() or 1), n // _kernels.LANES)), *result.values(),
