@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import click
 
 __all__ = [
+    "Progress",
     "Session",
     "common_options",
     "emit_json",
@@ -91,26 +92,48 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> N
     """Print a small table for a person; with ``--json`` it goes to standard error."""
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    grid = Table(title=title, title_justify="left", header_style="bold")
+    # as Text, since square brackets hold units here and are no markup
+    grid = Table(title=Text(title), title_justify="left", header_style="bold")
     for i, name in enumerate(header):
-        grid.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+        grid.add_column(Text(name), justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
-        grid.add_row(*row)
+        grid.add_row(*(Text(cell) for cell in row))
     Console(file=sys.stderr if wants_json() else sys.stdout).print(grid)
 
 
 @contextlib.contextmanager
-def progress(text: str) -> Iterator[Callable[[int, int], None]]:
-    """Give a callback ``(done, total)`` that draws a bar on standard error if that is a terminal."""
+def progress(text: str) -> Iterator[Progress]:
+    """Give a callback that draws a bar on standard error if that is a terminal."""
     if not sys.stderr.isatty():
-        yield lambda _done, _total: None
+        yield Progress(None)
         return
     from rich.console import Console
-    from rich.progress import Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+    from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    default = Progress.get_default_columns()[:-1]
+    default = Bar.get_default_columns()[:-1]
     columns = (*default, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(text, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        shown = Progress(bar)
+        shown.stage(text)
+        yield shown
+
+
+class Progress:
+    """Called with (done, total) of a stage; draws nothing without a bar."""
+
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+        self._task: Any = None
+
+    def stage(self, text: str) -> None:
+        """Begin another stage, with a bar of its own."""
+        if self._bar is not None:
+            self._task = self._bar.add_task(text, total=None)
+
+    def __call__(self, done: int, total: int) -> None:
+        """Move the bar."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=total)

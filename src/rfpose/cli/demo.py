@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, table, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
+from rfpose.cli.evaluate import show_evaluation
 
 __all__ = ["command"]
 
@@ -25,15 +26,13 @@ __all__ = ["command"]
 @common_options
 def command(output: Path, seed: int, force: bool) -> None:
     """Simulate a field of 12 heliostats, process the recording, evaluate it and draw it."""
-    from rfpose.pipeline.demo import STAGES, run_demo
+    from rfpose.pipeline.demo import run_demo
 
-    with progress(STAGES[0]) as on_progress:
-        outcome = run_demo(output, seed=seed, force=force, on_progress=on_progress, on_stage=lambda text: say(text))
+    with progress("Preparing") as shown:
+        outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage)
     if wants_json():
         emit_json({**outcome.evaluation.as_dict(), "files": outcome.files})
         return
-    table("Mirror normals measured by radio", *outcome.evaluation.as_table())
-    for reason, count in outcome.evaluation.failure_reasons.items():
-        say(f"  {count} mirror-frames failed: {reason}")
+    show_evaluation(outcome.evaluation, title="Mirror normals measured by radio")
     for what, path in outcome.files.items():
         say(f"{what.replace('_', ' ')}: {path}")

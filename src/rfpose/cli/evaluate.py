@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from rfpose.cli._support import common_options, emit_json, examples, say, table, wants_json
 
-__all__ = ["command"]
+if TYPE_CHECKING:
+    from rfpose.pipeline.evaluate import Evaluation, Statistics
+
+__all__ = ["command", "show_evaluation"]
 
 
 @click.command(
@@ -36,7 +40,32 @@ def command(result: Path, truth: Path | None) -> None:
     if wants_json():
         emit_json(evaluation.as_dict())
         return
-    table(str(result), *evaluation.as_table())
-    table("By heliostat", *evaluation.heliostat_table())
+    show_evaluation(evaluation, title=str(result))
+    rows = [
+        [
+            row.id,
+            str(row.solved),
+            str(row.failed),
+            *(f"{value:.3f}" for value in (row.normal_error_mrad.rms, row.normal_error_mrad.max, row.bound_mrad)),
+        ]
+        for row in evaluation.heliostats
+    ]
+    table("By heliostat [mrad of the normal]", ["", "solved", "failed", "rms", "worst", "bound"], rows)
+
+
+def show_evaluation(evaluation: Evaluation, *, title: str) -> None:
+    """Print the table of an evaluation."""
+    normal, position = evaluation.normal_error_mrad, evaluation.position_error_m
+    rows = [
+        _row("mirror normal [mrad]", normal, evaluation.bound_mrad, factor=1.0),
+        _row("receiver position [mm]", position, evaluation.bound_m, factor=1e3),
+    ]
+    table(title, ["error", "rms", "median", "worst", "bound"], rows)
+    say(f"rms over bound: {evaluation.ratio_to_bound:.3f} (bound from the {evaluation.bound_source}'s noise)")
+    say(f"mirror-frames: {evaluation.solved} solved, {evaluation.failed} failed")
     for reason, count in evaluation.failure_reasons.items():
-        say(f"  {count} mirror-frames failed: {reason}")
+        say(f"  {count}: {reason}")
+
+
+def _row(name: str, error: Statistics, bound: float, *, factor: float) -> list[str]:
+    return [name, *(f"{factor * value:.3f}" for value in (error.rms, error.median, error.max, bound))]

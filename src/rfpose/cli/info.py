@@ -31,17 +31,28 @@ def command(file: Path) -> None:
 
 
 def _print(data: Mapping[str, Any], *, indent: int) -> None:
-    """Print nested facts, one a line."""
+    """Print nested facts, one a line; a table of tables has one row a line."""
     for key, value in data.items():
         name = " " * indent + key.replace("_", " ")
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value and all(isinstance(item, Mapping) for item in value.values()):
+            say(f"{name}:")
+            for row, facts in value.items():
+                say(
+                    f"{' ' * indent}  {row}: "
+                    + ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in facts.items())
+                )
+        elif isinstance(value, Mapping) and value:
             say(f"{name}:")
             _print(value, indent=indent + 2)
-        elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
-            say(f"{name}:")
-            for item in value:
-                say(" " * (indent + 2) + ", ".join(f"{k.replace('_', ' ')} {v}" for k, v in item.items()))
-        elif isinstance(value, list | tuple):
-            say(f"{name}: {', '.join(str(item) for item in value) or 'none'}")
         else:
-            say(f"{name}: {'unknown' if value is None else value}")
+            say(f"{name}: {_text(value)}")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    if isinstance(value, list | tuple | Mapping):
+        return ", ".join(_text(item) for item in value) or "none"
+    return "unknown" if value is None else str(value)

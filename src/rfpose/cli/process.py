@@ -70,8 +70,8 @@ def command(
 
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
-    from rfpose.pipeline.process import process
     from rfpose.pipeline.files import refuse_existing
+    from rfpose.pipeline.process import process
     from rfpose.pipeline.result_file import summarise, write_poses_csv
 
     session.when_interrupted = "interrupted; the same command resumes where it stopped"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +17,9 @@ from rfpose.pipeline.files import refuse_existing
 from rfpose.pipeline.measure import journal_key, measure_tones
 from rfpose.pipeline.result_file import Result, write_result
 from rfpose.pipeline.solve import check_solvable, solve
+from rfpose.pipeline.truth_rows import align_truth
 from rfpose.recording import Recording, check_against, frame_starts, open_recording
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.truth import Truth
 
 __all__ = ["process"]
 
@@ -153,40 +152,3 @@ def _settings(recording: Recording, *, estimator: str, pose: str, scenario_path:
         "estimator": estimator,
         "pose": pose,
     }
-
-
-def align_truth(truth: Truth, scenario: Scenario) -> Truth:
-    """Put a truth's rows into the order of a scenario's; what it does not know becomes NaN."""
-    heliostat = _order(truth.heliostat_ids, scenario.heliostat_ids)
-    receiver = _order(truth.receiver_ids, scenario.receiver_ids)
-    transmitter = _order(truth.transmitter_ids, scenario.transmitter_ids)
-    snr = _taken(truth.tone_snr, receiver, axis=1)
-    return Truth(
-        heliostat_ids=scenario.heliostat_ids,
-        receiver_ids=scenario.receiver_ids,
-        transmitter_ids=scenario.transmitter_ids,
-        normal_enu=_taken(truth.normal_enu, heliostat, axis=1),
-        receiver_enu_m=_taken(truth.receiver_enu_m, receiver, axis=1),
-        frame_start_index=truth.frame_start_index,
-        transmitter_phase_rad=_taken(truth.transmitter_phase_rad, transmitter, axis=1),
-        clock_ppm=_taken(truth.clock_ppm, receiver, axis=0),
-        receiver_delay_s=_taken(truth.receiver_delay_s, receiver, axis=1),
-        tone_snr=_taken(snr, transmitter, axis=2),
-    )
-
-
-def _order(found: Sequence[str], wanted: Sequence[str]) -> npt.NDArray[np.int64]:
-    """Return where each wanted name stands among those found, −1 for nowhere."""
-    place = {name: i for i, name in enumerate(found)}
-    return np.array([place.get(name, -1) for name in wanted], np.int64)
-
-
-def _taken(array: Any, index: npt.NDArray[np.int64], *, axis: int) -> Any:
-    if array is None:
-        return None
-    shape = [len(index) if i == axis else n for i, n in enumerate(array.shape)]
-    out = np.full(shape, np.nan)
-    known = np.flatnonzero(index >= 0)
-    place = (slice(None),) * axis
-    out[(*place, known)] = array[(*place, index[known])]
-    return out

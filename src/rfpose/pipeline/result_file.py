@@ -6,7 +6,6 @@ Every name in the file stands in `KEYS`, with axes, unit and meaning; writer and
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 from collections import Counter
 from collections.abc import Mapping
@@ -38,6 +37,7 @@ __all__ = [
     "PoseTable",
     "Result",
     "StatusArray",
+    "count_reasons",
     "frame_time",
     "is_result",
     "read_result",
@@ -426,7 +426,7 @@ class _Reader:
 # -- for people ----------------------------------------------------------------------------------------------
 
 
-def reasons(status: npt.NDArray[Any], codes: type[IntEnum]) -> dict[str, int]:
+def count_reasons(status: npt.NDArray[Any], codes: type[IntEnum]) -> dict[str, int]:
     """Count what went wrong, most frequent first; what went well is left out."""
     counted = Counter(int(code) for code in status.ravel() if code != 0)
     return {codes(code).reason: n for code, n in counted.most_common()}  # type: ignore[attr-defined]
@@ -449,7 +449,7 @@ def summarise(result: Result) -> dict[str, Any]:
     }
     for name, (status, codes) in parts.items():
         solved = int(np.count_nonzero(status == 0))
-        summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": reasons(status, codes)}
+        summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
     return summary
 
 

@@ -1,0 +1,45 @@
+"""``rfpose convert``: recordings between formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
+
+__all__ = ["FORMAT_NAMES", "command"]
+
+# Written out so that --help need not load h5py; a test holds them to rfpose.recording.
+FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
+
+
+@click.command(
+    name="convert",
+    epilog=examples(
+        "rfpose convert measured/drf -o recording.h5 --scenario site.toml",
+        "rfpose convert recording.h5 -o measured/drf --to digital-rf",
+    ),
+)
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File or directory to make.")
+@click.option(
+    "--to", "format_name", type=click.Choice(FORMAT_NAMES), default="rfpose-iq", show_default=True, help="Format."
+)
+@click.option("--scenario", type=click.Path(path_type=Path), help="Site description to go with it.")
+@force_option
+@common_options
+def command(recording: Path, output: Path, format_name: Any, scenario: Path | None, force: bool) -> None:
+    """Write a recording in another format; samples, times and gaps stay exactly as they are."""
+    from rfpose.recording import convert, open_recording
+    from rfpose.scenario import load_scenario
+
+    given = None if scenario is None else load_scenario(scenario)
+    with open_recording(recording, scenario=given) as source, progress("Converting") as on_progress:
+        convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
+        found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
+    if wants_json():
+        emit_json(found)
+    else:
+        say(f"{output}: {format_name}, {found['receivers']} receivers")

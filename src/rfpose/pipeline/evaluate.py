@@ -1,0 +1,321 @@
+"""How far a result is from the truth, and from the best that its noise allows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, as_float_array
+from rfpose.dsp.bounds import phase_bound_rad
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.geometry import angle_between_rad, unit
+from rfpose.multilat import FixStatus, PoseStatus, normal_bound, position_bound
+from rfpose.pipeline.result_file import Result, count_reasons, is_result, read_result
+from rfpose.pipeline.truth_rows import align_truth, truth_rows
+from rfpose.recording import open_recording
+from rfpose.scenario import Scenario
+from rfpose.truth import Truth
+
+__all__ = ["Evaluation", "HeliostatRow", "Statistics", "evaluate", "read_truth"]
+
+_UNUSABLE_PHASE_RAD = 1.0
+"""A tone whose phase cannot be known better than this is as good as not received."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Statistics:
+    """Of errors that are never negative; NaN where there is none."""
+
+    rms: float
+    median: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: npt.ArrayLike) -> Statistics:
+        """Summarise the finite ones among ``errors``, any shape."""
+        values = np.asarray(errors, np.float64).ravel()
+        values = values[np.isfinite(values)]
+        if not values.size:
+            return cls(rms=np.nan, median=np.nan, p95=np.nan, max=np.nan)
+        return cls(
+            rms=float(np.sqrt(np.mean(values**2))),
+            median=float(np.median(values)),
+            p95=float(np.percentile(values, 95)),
+            max=float(values.max()),
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the four by name."""
+        return {"rms": self.rms, "median": self.median, "p95": self.p95, "max": self.max}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeliostatRow:
+    """One heliostat over all frames."""
+
+    id: str
+    solved: int
+    failed: int
+    normal_error_mrad: Statistics
+    bound_mrad: float
+    sigma_mrad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """Errors of a result against the truth; a milliradian here is of the mirror normal.
+
+    Attributes
+    ----------
+    normal_error_mrad
+        Angle between measured and true normal, over solved mirror-frames.
+    position_error_m
+        Distance between measured and true place of the receivers on mirrors, over solved fixes.
+    bound_mrad, bound_m
+        RMS of the lower bounds over the same mirror-frames and fixes.
+    bound_source
+        ``"truth"``: from the true signal-to-noise ratios. ``"result"``: from the sigmas that the result reports.
+    ratio_to_bound
+        RMS normal error over RMS bound.
+    sigma_mrad
+        RMS of the standard deviations that the result reports for its normals.
+    solved, failed
+        Mirror-frames; one that is marked doubtful counts as failed.
+    failure_reasons
+        Mirror-frames by reason.
+    heliostats
+        One row each.
+    normal_error_rad, bound_rad : (frame, heliostat)
+        What the figures were made of; NaN where not solved or not known.
+    """
+
+    normal_error_mrad: Statistics
+    position_error_m: Statistics
+    bound_mrad: float
+    bound_m: float
+    bound_source: str
+    ratio_to_bound: float
+    sigma_mrad: float
+    solved: int
+    failed: int
+    failure_reasons: Mapping[str, int]
+    heliostats: tuple[HeliostatRow, ...]
+    normal_error_rad: FloatArray
+    bound_rad: FloatArray
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what ``rfpose evaluate --json`` prints; its keys are a contract."""
+        return {
+            "normal_error_mrad": self.normal_error_mrad.as_dict(),
+            "position_error_m": self.position_error_m.as_dict(),
+            "bound_mrad": {"rms": self.bound_mrad},
+            "bound_m": {"rms": self.bound_m},
+            "bound_source": self.bound_source,
+            "ratio_to_bound": self.ratio_to_bound,
+            "sigma_mrad": {"rms": self.sigma_mrad},
+            "solved": self.solved,
+            "failed": self.failed,
+            "failure_reasons": dict(self.failure_reasons),
+            "heliostats": [
+                {
+                    "id": row.id,
+                    "solved": row.solved,
+                    "failed": row.failed,
+                    "normal_error_mrad": row.normal_error_mrad.as_dict(),
+                    "bound_mrad": {"rms": row.bound_mrad},
+                    "sigma_mrad": {"rms": row.sigma_mrad},
+                }
+                for row in self.heliostats
+            ],
+        }
+
+
+# -- truth ---------------------------------------------------------------------------------------------------
+
+
+def read_truth(path: str | Path, scenario: Scenario) -> Truth:
+    """Read a truth from a recording, a result or a JSON file, with rows in the scenario's order.
+
+    The JSON file holds ``heliostats``, a list of ``id``, ``normal_enu`` and ``receivers_enu_m`` (positions in the
+    order of the scenario's ``receiver_ids``); it holds for every frame.
+
+    Raises
+    ------
+    RecordingError
+        The file is missing, holds no truth, or is malformed.
+    """
+    path = Path(path)
+    if path.suffix == ".json":
+        return _truth_from_json(path, scenario)
+    if is_result(path):
+        truth = read_result(path).truth
+    else:
+        with open_recording(path) as recording:
+            truth = recording.truth
+    if truth is None:
+        raise RecordingError(f"{path}: holds no truth; give a simulated recording or a JSON file")
+    return align_truth(truth, scenario)
+
+
+def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
+    normal_enu = np.full((1, len(scenario.heliostat_ids), 3), np.nan)
+    receiver_enu_m = np.full((1, len(scenario.receiver_ids), 3), np.nan)
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))["heliostats"]
+        for entry in entries:
+            if entry["id"] not in scenario.heliostat_ids:
+                continue
+            i = scenario.heliostat_ids.index(entry["id"])
+            rows = scenario.receiver_rows(i)
+            normal_enu[0, i] = unit(as_float_array("normal_enu", entry["normal_enu"], (3,)))
+            receiver_enu_m[0, rows] = as_float_array(
+                "receivers_enu_m", entry["receivers_enu_m"], (rows.stop - rows.start, 3)
+            )
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read the truth: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        what = f"`{error.args[0]}` is missing" if isinstance(error, KeyError) else str(error)
+        raise RecordingError(
+            f"{path}: not a truth file: {what}; it must hold `heliostats`, each with `id`, `normal_enu` and "
+            "`receivers_enu_m`"
+        ) from error
+    return Truth(
+        heliostat_ids=scenario.heliostat_ids,
+        receiver_ids=scenario.receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        normal_enu=normal_enu,
+        receiver_enu_m=receiver_enu_m,
+    )
+
+
+# -- comparison ----------------------------------------------------------------------------------------------
+
+
+def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
+    """Compare a result with the truth and with the bound.
+
+    The bound is that of receivers located each on its own, at the true geometry, with the noise of the receiver
+    and that of the calibration receivers (Cramér–Rao for each tone phase, position and normal).
+
+    Parameters
+    ----------
+    result
+        From `rfpose.pipeline.process.process` or `rfpose.pipeline.result_file.read_result`.
+    truth
+        Rows as in ``result.scenario`` (see `read_truth`); without it what the result carries.
+
+    Raises
+    ------
+    InvalidInputError
+        No truth anywhere, or none for these frames.
+    """
+    truth = result.truth if truth is None else truth
+    if truth is None:
+        raise InvalidInputError("the result carries no truth; give one with --truth FILE (simulated recording or JSON)")
+    rows = truth_rows(truth, result.frame_start_index)
+    if not np.any(rows >= 0):
+        raise InvalidInputError("the truth is of another time: it has none of the result's frames")
+    normal_true = _of_frames(truth.normal_enu, rows)
+    receiver_true = _of_frames(truth.receiver_enu_m, rows)
+    is_mirror = np.array([row.heliostat is not None for row in result.scenario.receivers], bool)
+
+    solved = result.poses.status == PoseStatus.OK
+    located = (result.fixes.status == FixStatus.OK) & is_mirror
+    normal_error = np.where(solved, angle_between_rad(result.poses.normal_enu, normal_true), np.nan)
+    position_error = np.where(located, np.linalg.norm(result.fixes.position_enu_m - receiver_true, axis=-1), np.nan)
+    own_m, calibration_m, source = _noise(result, truth, rows)
+    bound = np.where(
+        np.isfinite(normal_error), _normal_bound(result.scenario, receiver_true, own_m, calibration_m), np.nan
+    )
+    total_m = np.hypot(own_m, calibration_m)
+    position_cov = position_bound(result.scenario.transmitter_enu_m, receiver_true, total_m)
+    bound_m = np.where(np.isfinite(position_error), np.sqrt(np.trace(position_cov, axis1=-2, axis2=-1)), np.nan)
+    sigma = np.where(solved, result.poses.sigma_rad, np.nan)
+
+    comparable = np.isfinite(bound)
+    ratio = _rms(normal_error[comparable]) / _rms(bound[comparable]) if comparable.any() else np.nan
+    return Evaluation(
+        normal_error_mrad=Statistics.of(1e3 * normal_error),
+        position_error_m=Statistics.of(position_error),
+        bound_mrad=1e3 * _rms(bound),
+        bound_m=_rms(bound_m),
+        bound_source=source,
+        ratio_to_bound=ratio,
+        sigma_mrad=1e3 * _rms(sigma),
+        solved=int(np.count_nonzero(solved)),
+        failed=int(np.count_nonzero(~solved)),
+        failure_reasons=count_reasons(result.poses.status, PoseStatus),
+        heliostats=tuple(
+            HeliostatRow(
+                id=name,
+                solved=int(np.count_nonzero(solved[:, i])),
+                failed=int(np.count_nonzero(~solved[:, i])),
+                normal_error_mrad=Statistics.of(1e3 * normal_error[:, i]),
+                bound_mrad=1e3 * _rms(bound[:, i]),
+                sigma_mrad=1e3 * _rms(sigma[:, i]),
+            )
+            for i, name in enumerate(result.scenario.heliostat_ids)
+        ),
+        normal_error_rad=normal_error,
+        bound_rad=bound,
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return Statistics.of(values).rms
+
+
+def _of_frames(array: FloatArray, rows: npt.NDArray[np.int64]) -> FloatArray:
+    """Pick the truth's row of each frame; NaN where there is none."""
+    picked = np.array(array[np.maximum(rows, 0)], np.float64)
+    picked[rows < 0] = np.nan
+    return picked
+
+
+def _noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray, str]:
+    """Return range noise of receivers and of calibration (frame, receiver, transmitter) [m], and where it is from."""
+    if truth.tone_snr is None:
+        return result.ranges.sigma_m, result.ranges.calibration_sigma_m, "result"
+    scenario = result.scenario
+    snr = _of_frames(truth.tone_snr, rows)
+    with np.errstate(invalid="ignore"):
+        snr = np.where(snr > 0.0, snr, np.nan)
+        phase = phase_bound_rad(scenario.radio.frame_samples, snr)
+        phase = np.where(phase < _UNUSABLE_PHASE_RAD, phase, np.nan)
+    own_m = _combine(phase * scenario.wavelength_m / (2.0 * np.pi))
+    is_calibration = np.array([row.calibration is not None for row in scenario.receivers], bool)
+    calibration_m = _combine(np.moveaxis(own_m[:, is_calibration], 1, -1))
+    return own_m, np.broadcast_to(calibration_m[:, None], own_m.shape), "truth"
+
+
+def _combine(sigma: FloatArray) -> FloatArray:
+    """Return the standard deviation of the weighted mean over the last axis; NaN entries do not take part."""
+    information = np.nansum(sigma**-2.0, axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.where(information > 0.0, information**-0.5, np.nan)
+
+
+def _normal_bound(
+    scenario: Scenario, receiver_enu_m: FloatArray, own_m: FloatArray, calibration_m: FloatArray
+) -> FloatArray:
+    """Return the bound of the angle of each mirror's normal (frame, heliostat) [rad]."""
+    bound = np.full((len(receiver_enu_m), len(scenario.heliostat)), np.nan)
+    received = np.isfinite(own_m) & np.isfinite(calibration_m)
+    own_m, calibration_m = (np.where(received, a, np.nan) for a in (own_m, calibration_m))
+    for i, heliostat in enumerate(scenario.heliostat):
+        rows = scenario.receiver_rows(i)
+        bound[:, i] = normal_bound(
+            scenario.transmitter_enu_m,
+            receiver_enu_m[:, rows],
+            own_m[:, rows],
+            calibration_m[:, rows],
+            receiver_mirror_m=heliostat.receiver_mirror_m,
+        ).sigma_rad
+    return bound

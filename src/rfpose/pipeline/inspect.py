@@ -1,0 +1,78 @@
+"""What a file holds, whatever of ours it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rfpose.errors import GeometryError, ScenarioError
+from rfpose.pipeline.result_file import frame_time, is_result, read_result, summarise
+from rfpose.pipeline.solve import POSES, check_solvable
+from rfpose.recording import describe, open_recording
+from rfpose.scenario import Scenario, load_scenario
+
+__all__ = ["inspect_file"]
+
+
+def inspect_file(path: str | Path) -> dict[str, Any]:
+    """Describe a recording, a result or a scenario, ready for JSON.
+
+    Returns
+    -------
+    dict
+        ``kind`` is ``"recording"``, ``"result"`` or ``"scenario"``; ``sound`` tells whether ``problems`` is empty.
+
+    Raises
+    ------
+    RecordingError, ScenarioError
+        The file is missing, damaged or none of these.
+    """
+    path = Path(path)
+    if path.suffix == ".toml":
+        return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
+    if path.is_file() and is_result(path):
+        return {"kind": "result", "path": str(path), **_result(path)}
+    with open_recording(path) as recording:
+        return {"kind": "recording", **describe(recording)}
+
+
+def _scenario(scenario: Scenario) -> dict[str, Any]:
+    problems = []
+    try:
+        check_solvable(scenario, pose=POSES[0])
+    except (ScenarioError, GeometryError) as error:
+        problems.append(str(error))
+    radio = scenario.radio
+    return {
+        "name": scenario.name,
+        "transmitters": len(scenario.transmitter),
+        "heliostats": len(scenario.heliostat),
+        "receivers": len(scenario.receiver_ids),
+        "calibration_receivers": len(scenario.calibration_receiver),
+        "tone_hz": scenario.tone_hz.tolist(),
+        "wavelength_m": scenario.wavelength_m.tolist(),
+        "sample_rate_hz": radio.sample_rate_hz,
+        "centre_frequency_hz": radio.centre_frequency_hz,
+        "frame_samples": radio.frame_samples,
+        "frame_s": radio.frame_samples / radio.sample_rate_hz,
+        "problems": problems,
+        "sound": not problems,
+    }
+
+
+def _result(path: Path) -> dict[str, Any]:
+    result = read_result(path)
+    starts = result.frame_start_index
+    times = [frame_time(int(starts[i]), result.sample_rate).isoformat() for i in (0, -1)] if len(starts) else [None] * 2
+    summary = summarise(result)
+    problems = [f"{count} poses: {reason}" for reason, count in summary["poses"]["reasons"].items()]
+    return {
+        "scenario": result.scenario.name,
+        "settings": dict(result.settings),
+        "first_frame_utc": times[0],
+        "last_frame_utc": times[1],
+        **{key: value for key, value in summary.items() if key not in ("estimator", "pose")},
+        "has_truth": result.truth is not None,
+        "problems": problems,
+        "sound": not problems,
+    }
