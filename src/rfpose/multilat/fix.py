@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,8 @@ StatusArray = npt.NDArray[np.int8]
 STEP_TOLERANCE_SIGMA = 1e-6
 # A cold start is taken again from elsewhere when its residuals are less likely than this.
 RESTART_PROBABILITY = 1e-3
+# A solution on the side where receivers are known to be is taken unless its residuals are less likely than this.
+SIDE_PROBABILITY = 1e-6
 
 
 class FixStatus(IntEnum):
@@ -109,6 +111,7 @@ def locate(
     sigma_m: npt.ArrayLike | float,
     start_enu_m: npt.ArrayLike | None = None,
     max_dop: float = 100.0,
+    side: Literal["below", "above"] | None = "below",
     max_iteration: int = 30,
     min_probability: float = 1e-9,
 ) -> Fixes:
@@ -131,6 +134,10 @@ def locate(
         unlikely is sought again from other starts.
     max_dop
         A larger dilution of precision makes a row WEAK_GEOMETRY.
+    side
+        Transmitters of similar height have a second solution near the mirror image in their plane, which noise can
+        make the better one. The solution on this side of the plane is taken where it is likely too. None: least
+        squares alone decides. Without effect in two dimensions or with a given start.
     max_iteration
         Gauss-Newton steps before a row is given up.
     min_probability
@@ -161,6 +168,8 @@ def locate(
     max_dop = _positive_or_inf("max_dop", max_dop)
     if not 1 <= max_iteration <= 10_000:
         raise InvalidInputError(f"`max_iteration` must lie between 1 and 10000, got {max_iteration}")
+    if side not in ("below", "above", None):
+        raise InvalidInputError(f"`side` must be 'below', 'above' or None, got {side!r}")
     if not 0.0 <= min_probability < 1.0:
         raise InvalidInputError(f"`min_probability` must lie in [0, 1), got {min_probability}")
     centre = np.zeros(3)
@@ -176,6 +185,8 @@ def locate(
     result = problem.solve(ranges, weight, start)
     if start is None:
         _restart(problem, ranges, weight, result)
+        if side is not None and n_axis == 3:
+            _take_side(problem, ranges, weight, result, 1.0 if side == "above" else -1.0)
     _judge(result, n_axis, max_dop, min_probability)
     return Fixes(**{name: read_only(array) for name, array in result.items()})
 
@@ -266,19 +277,30 @@ class _Problem:
         )  # fmt: skip
         return result
 
-    def other_starts(self, position_enu_m: FloatArray) -> list[FloatArray]:
-        """Where to try again: below, above and beside the transmitters, and mirrored through their plane."""
-        n_axis = self.transmitter.shape[1]
-        middle = self.centre[:n_axis]
+    def axes(self) -> FloatArray:
+        """Principal axes of the transmitters, one a row, widest first; the last is their plane's normal, upwards."""
+        middle = self.centre[: self.transmitter.shape[1]]
         axes = np.linalg.svd(self.transmitter - middle, full_matrices=False)[2]
-        up = axes[-1] if axes[-1][-1] >= 0 else -axes[-1]
-        n = len(position_enu_m)
-        starts = [np.broadcast_to(middle + h * self.scale * up, (n, n_axis)) for h in (-0.3, 0.3, -1.0, 1.0)]
-        for a in axes[:-1]:
-            starts += [np.broadcast_to(middle + (s * a - 0.3 * up) * self.scale, (n, n_axis)) for s in (-0.7, 0.7)]
-        height = (position_enu_m - middle) @ up
-        mirrored = position_enu_m - 2.0 * height[:, None] * up
-        return [np.where(np.isfinite(mirrored), mirrored, middle), *starts]
+        axes[-1] *= -1.0 if axes[-1, -1] < 0.0 else 1.0
+        return np.asarray(axes)
+
+    def height(self, position_enu_m: FloatArray) -> FloatArray:
+        """Height above the transmitters' plane [m]."""
+        return np.asarray((position_enu_m - self.centre[: self.transmitter.shape[1]]) @ self.axes()[-1])
+
+    def mirrored(self, position_enu_m: FloatArray) -> FloatArray:
+        """Positions mirrored in the transmitters' plane; a NaN becomes their centroid."""
+        image = position_enu_m - 2.0 * self.height(position_enu_m)[:, None] * self.axes()[-1]
+        return np.where(np.isfinite(image), image, self.centre[: self.transmitter.shape[1]])
+
+    def other_starts(self, position_enu_m: FloatArray) -> list[FloatArray]:
+        """Where to try again: mirrored in the transmitters' plane, then below, above and beside their centroid."""
+        axes = self.axes()
+        up = axes[-1]
+        offsets = [h * up for h in (-0.3, 0.3, -1.0, 1.0)]
+        offsets += [s * a - 0.3 * up for a in axes[:-1] for s in (-0.7, 0.7)]
+        middle = self.centre[: self.transmitter.shape[1]]
+        return [self.mirrored(position_enu_m), *(middle[None] + self.scale * o for o in offsets)]
 
 
 def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: dict[str, npt.NDArray[Any]]) -> None:
@@ -296,6 +318,23 @@ def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: 
             better = (again["status"] == FixStatus.OK) & ~(again["chi2"] >= result["chi2"][rows])
         for name, array in again.items():
             result[name][rows[better]] = array[better]
+
+
+def _take_side(
+    problem: _Problem, ranges: FloatArray, weight: FloatArray, result: dict[str, npt.NDArray[Any]], sign: float
+) -> None:
+    """Look for a likely solution on the wanted side of the transmitters' plane for rows that lie on the other."""
+    rows = np.flatnonzero((result["status"] == FixStatus.OK) & (sign * problem.height(result["position_enu_m"]) < 0.0))
+    if not rows.size:
+        return
+    row_weight = weight if len(weight) == 1 else weight[rows]
+    again = problem.solve(ranges[rows], row_weight, problem.mirrored(result["position_enu_m"][rows]))
+    limit = _chi2_limit(again["n_transmitter"] - 4, SIDE_PROBABILITY)
+    with np.errstate(invalid="ignore"):
+        better = (again["status"] == FixStatus.OK) & (sign * problem.height(again["position_enu_m"]) > 0.0)
+        better &= (again["chi2"] <= limit) | (again["chi2"] <= result["chi2"][rows])
+    for name, array in again.items():
+        result[name][rows[better]] = array[better]
 
 
 def _chi2_limit(dof: npt.NDArray[np.signedinteger[Any]], probability: float) -> FloatArray:
