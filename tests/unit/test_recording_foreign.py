@@ -1,0 +1,390 @@
+"""Digital RF and SigMF, written by their own libraries, and conversion between all formats."""
+
+import json
+import math
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.recording import GapError, RecordingWriter, convert, count_fill, describe, open_recording
+from rfpose.scenario import load_scenario
+
+drf = pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
+sigmf = pytest.importorskip("sigmf", reason="the sigmf library is not installed")
+
+EPOCH = 1_790_000_000 * 10**6
+SCENARIO = load_scenario(Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml")
+
+
+def counts(n, seed=0):
+    return np.random.default_rng(seed).integers(-32767, 32768, size=(n, 2), dtype=np.int16)
+
+
+def write_drf(top, channel, pieces, *, dtype="<i2", rate=(10**6, 1), subchannels=1, continuous=False, **settings):
+    """Write pieces [(start after EPOCH, samples)] as one channel, in files of 10 ms."""
+    (top / channel).mkdir(parents=True)
+    writer = drf.DigitalRFWriter(
+        str(top / channel), dtype, 3600, 10, EPOCH, *rate, uuid_str="test", is_continuous=continuous,
+        num_subchannels=subchannels, marching_periods=False, **settings,
+    )  # fmt: skip
+    for start, samples in pieces:
+        writer.rf_write(samples, start)
+    writer.close()
+
+
+def write_sigmf(directory, name, samples, captures, *, datatype="ci16_le", rate=1e6, **extra):
+    directory.mkdir(exist_ok=True)
+    (directory / f"{name}.sigmf-data").write_bytes(samples.tobytes())
+    meta = {
+        "global": {"core:datatype": datatype, "core:sample_rate": rate, "core:version": "1.2.0"} | extra,
+        "captures": captures,
+        "annotations": [],
+    }
+    (directory / f"{name}.sigmf-meta").write_text(json.dumps(meta))
+    return directory
+
+
+# -- Digital RF ----------------------------------------------------------------------------------------------
+
+
+def test_drf_with_gaps_across_files(tmp_path):
+    x = counts(60_000)
+    write_drf(tmp_path / "d", "r1", [(0, x[:25_000]), (26_000, x[26_000:26_010]), (40_000, x[40_000:])])
+    write_drf(tmp_path / "d", "r0", [(100, x[100:])])
+    with open_recording(tmp_path / "d") as r:
+        assert r.format == "digital-rf"
+        assert r.receiver_ids == ("r0", "r1")
+        assert r.sample_rate == 10**6
+        assert r.centre_frequency_hz is None
+        assert r.blocks("r1").tolist() == [[EPOCH, 25_000], [EPOCH + 26_000, 10], [EPOCH + 40_000, 20_000]]
+        assert r.blocks("r0").tolist() == [[EPOCH + 100, 59_900]]
+        for start, count in r.blocks("r1").tolist():
+            assert np.array_equal(r.read("r1", start, count), x[start - EPOCH : start - EPOCH + count])
+        assert np.array_equal(r.read("r1", EPOCH + 9_990, 30), x[9_990:10_020])
+        with pytest.raises(GapError, match=f"did not record sample {EPOCH + 25_000}"):
+            r.read("r1", EPOCH + 24_000, 2_010)
+
+
+def test_drf_that_fills_holes_shows_the_fill_value(tmp_path):
+    x = counts(30_000)
+    write_drf(tmp_path / "d", "r0", [(0, x[:12_000]), (15_000, x[15_000:])], continuous=True)
+    with open_recording(tmp_path / "d") as r:
+        ((start, count),) = r.blocks("r0").tolist()
+        got = r.read("r0", start, count)
+        assert count_fill(got[:30_000]) == 3_000
+        assert np.all(got[12_000:15_000] == r.fill_value)
+        assert "3000 of 30000 samples looked at hold the fill value" in " ".join(describe(r)["problems"])
+
+
+def test_drf_floats(tmp_path):
+    z = np.random.default_rng(0).normal(size=(20_000, 2)).astype(np.float32)
+    write_drf(tmp_path / "d", "r0", [(0, z)], dtype="<c8")
+    with open_recording(tmp_path / "d") as r:
+        assert r.sample_format == "complex64"
+        assert r.full_scale == math.inf
+        assert r.read("r0", EPOCH, 20_000).tobytes() == z.tobytes()
+
+
+def test_drf_big_endian_and_odd_rate(tmp_path):
+    x = counts(5_000)
+    write_drf(tmp_path / "d", "r0", [(0, x.astype(">i2"))], dtype=">i2", rate=(10**8, 3))
+    with open_recording(tmp_path / "d") as r:
+        assert r.sample_rate == Fraction(10**8, 3)
+        assert np.array_equal(r.read("r0", EPOCH, 5_000), x)
+
+
+def test_drf_subchannels_are_receivers(tmp_path):
+    x = counts(15_000).reshape(-1, 4)  # two subchannels, interleaved
+    write_drf(tmp_path / "d", "H01", [(0, x)], subchannels=2)
+    with open_recording(tmp_path / "d") as r:
+        assert r.receiver_ids == ("H01_r0", "H01_r1")
+        assert np.array_equal(r.read("H01_r0", EPOCH, 7_500), x[:, :2])
+        assert np.array_equal(r.read("H01_r1", EPOCH, 7_500), x[:, 2:])
+
+
+def test_drf_compressed_reads_the_same(tmp_path):
+    x = counts(30_000)
+    write_drf(tmp_path / "d", "r0", [(0, x)], compression_level=1, checksum=True)
+    with open_recording(tmp_path / "d") as r:
+        assert np.array_equal(r.read("r0", EPOCH + 5, 29_000), x[5:29_005])
+
+
+def test_drf_takes_a_scenario_beside_the_channels(tmp_path):
+    write_drf(tmp_path / "d", "r0", [(0, counts(10))])
+    (tmp_path / "d" / "scenario.toml").write_text(SCENARIO.to_toml())
+    with open_recording(tmp_path / "d") as r:
+        assert r.scenario is not None
+        assert r.scenario.name == SCENARIO.name
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"dtype": "<i1"}, "channel `r0` holds complex samples of 8 bits"),
+        ({"dtype": "<f8"}, "channel `r0` holds complex samples of 64 bits"),
+        ({"is_complex": False, "subchannels": 2}, "channel `r0` holds real samples of 16 bits"),
+    ],
+)
+def test_drf_of_another_type(tmp_path, settings, words):
+    dtype = np.dtype(settings.get("dtype", "<i2"))
+    write_drf(tmp_path / "d", "r0", [(0, np.ones((100, 2), dtype))], **settings)
+    with pytest.raises(RecordingError, match=words):
+        open_recording(tmp_path / "d")
+
+
+def test_drf_channels_that_differ(tmp_path):
+    write_drf(tmp_path / "d", "r0", [(0, counts(10))])
+    write_drf(tmp_path / "d", "r1", [(0, counts(10))], rate=(2 * 10**6, 1))
+    with pytest.raises(RecordingError, match=r"`r1` \(2000000 Hz\) and channel `r0` \(int16 at 1000000 Hz\) differ"):
+        open_recording(tmp_path / "d")
+
+
+def test_drf_subchannel_and_channel_of_one_name(tmp_path):
+    write_drf(tmp_path / "d", "H", [(0, counts(20).reshape(-1, 4))], subchannels=2)
+    write_drf(tmp_path / "d", "H_r1", [(0, counts(10))])
+    with pytest.raises(RecordingError, match="rename one of the directories"):
+        open_recording(tmp_path / "d")
+
+
+def test_drf_given_too_deep(tmp_path):
+    write_drf(tmp_path / "d", "r0", [(0, counts(10))])
+    with pytest.raises(RecordingError, match="one channel of a Digital RF recording; give `.*/d` instead"):
+        open_recording(tmp_path / "d" / "r0")
+    with pytest.raises(RecordingError, match="one file of a Digital RF recording"):
+        open_recording(next((tmp_path / "d" / "r0").rglob("rf@*.h5")))
+
+
+def test_drf_damaged_file(tmp_path, capsys):
+    write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
+    middle = sorted((tmp_path / "d" / "r0").rglob("rf@*.h5"))[1]
+    middle.write_bytes(middle.read_bytes()[:3000])
+    with open_recording(tmp_path / "d") as r, pytest.raises(RecordingError, match="cannot read `r0`: .*truncated"):
+        r.blocks("r0")
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(("module", "extra"), [("digital_rf", "digital-rf"), ("sigmf", "sigmf")])
+def test_missing_library_names_the_extra(tmp_path, monkeypatch, module, extra):
+    write_drf(tmp_path / "digital_rf", "r0", [(0, counts(10))])
+    write_sigmf(tmp_path / "sigmf", "r0", counts(10), [])
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(RecordingError, match=rf"pip install 'rfpose\[{extra}\]'"):
+        open_recording(tmp_path / module)
+
+
+# -- SigMF ---------------------------------------------------------------------------------------------------
+
+
+def test_sigmf_directory_and_single_file(tmp_path):
+    x, y = counts(1000), counts(1000, seed=1)
+    stamp = {"core:sample_start": 0, "core:datetime": "2026-09-21T14:13:20.000001Z", "core:frequency": 1e8}
+    write_sigmf(tmp_path / "s", "r1", y, [stamp])
+    write_sigmf(tmp_path / "s", "r0", x, [stamp])
+    with open_recording(tmp_path / "s") as r:
+        assert r.format == "sigmf"
+        assert r.receiver_ids == ("r0", "r1")
+        assert r.centre_frequency_hz == 1e8
+        assert r.blocks("r1").tolist() == [[EPOCH + 1, 1000]]
+        assert np.array_equal(r.read("r1", EPOCH + 11, 500), y[10:510])
+    for suffix in ("meta", "data"):
+        with open_recording(tmp_path / "s" / f"r0.sigmf-{suffix}") as r:
+            assert r.receiver_ids == ("r0",)
+            assert np.array_equal(r.read("r0", EPOCH + 1, 1000), x)
+
+
+def test_sigmf_big_endian_and_float(tmp_path):
+    x, z = counts(100), np.random.default_rng(0).normal(size=(100, 2)).astype(np.float32)
+    write_sigmf(tmp_path / "i", "r", x.astype(">i2"), [], datatype="ci16_be")
+    write_sigmf(tmp_path / "f", "r", z, [], datatype="cf32_le")
+    with open_recording(tmp_path / "i") as r:
+        assert np.array_equal(r.read("r", 0, 100), x)
+    with open_recording(tmp_path / "f") as r:
+        assert r.sample_format == "complex64"
+        assert r.read("r", 0, 100).tobytes() == z.tobytes()
+
+
+DAY = "2026-09-21T14:13:20"
+
+
+@pytest.mark.parametrize(
+    ("captures", "blocks"),
+    [
+        ([], [[0, 1000]]),
+        ([{"core:global_index": 77}], [[77, 1000]]),
+        ([{"core:datetime": f"{DAY}Z"}], [[EPOCH, 1000]]),
+        # the stamp has no fraction, the index agrees to the second: the index is exact
+        ([{"core:datetime": f"{DAY}Z", "core:global_index": EPOCH + 123_456}], [[EPOCH + 123_456, 1000]]),
+        # the index counts from something else: the stamp holds, the index tells gaps
+        (
+            [{"core:datetime": f"{DAY}.5Z", "core:global_index": 10}, {"core:global_index": 600}],
+            [[EPOCH + 500_000, 400], [EPOCH + 500_590, 600]],
+        ),
+        # stamps alone, fine enough to tell a gap of 100 samples
+        (
+            [{"core:datetime": f"{DAY}.000000Z"}, {"core:datetime": f"{DAY}.000500Z"}],
+            [[EPOCH, 400], [EPOCH + 500, 600]],
+        ),
+        # stamps too coarse to tell: no gap is invented
+        ([{"core:datetime": f"{DAY}.000Z"}, {"core:datetime": f"{DAY}.001Z"}], [[EPOCH, 1000]]),
+        ([{"core:datetime": f"{DAY}Z"}, {}], [[EPOCH, 1000]]),
+    ],
+)
+def test_sigmf_time(tmp_path, captures, blocks):
+    for capture, start in zip(captures, (0, 400), strict=False):
+        capture["core:sample_start"] = start
+    x = counts(1000)
+    write_sigmf(tmp_path / "s", "r", x, captures)
+    with open_recording(tmp_path / "s") as r:
+        assert r.blocks("r").tolist() == blocks
+        got = [r.read("r", start, count) for start, count in blocks]
+        assert np.array_equal(np.concatenate(got), x)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"datatype": "cu8"}, "`core:datatype` is cu8; rfpose reads ci16 and cf32"),
+        ({"core:offset": 100}, "`core:offset` is not supported"),
+        ({"core:num_channels": 2}, "interleaved channels"),
+        ({"captures": [{"core:sample_start": 0, "core:header_bytes": 4}]}, "headers within the samples"),
+        ({"captures": [{"core:sample_start": 5000}]}, "capture 0 starts at sample 5000 of 1000.*truncated"),
+        (
+            {"captures": [{"core:sample_start": 0, "core:global_index": 50},
+                          {"core:sample_start": 400, "core:global_index": 60}]},
+            "capture 1 starts 390 samples before capture 0 ends",
+        ),
+        (
+            {"captures": [{"core:sample_start": 0, "core:frequency": 1e8},
+                          {"core:sample_start": 400, "core:frequency": 2e8}]},
+            "different `core:frequency`",
+        ),
+        ({"captures": [{"core:sample_start": 0, "core:datetime": "2026-09-21T14:13:20+01:00"}]}, "must look like"),
+    ],
+)  # fmt: skip
+def test_sigmf_that_cannot_be_read(tmp_path, change, words):
+    captures = change.pop("captures", [])
+    write_sigmf(tmp_path / "s", "r", counts(1000), captures, **change)
+    with pytest.raises(RecordingError, match=words) as caught:
+        open_recording(tmp_path / "s")
+    assert "r.sigmf-meta" in str(caught.value)
+
+
+def test_sigmf_broken_pairs(tmp_path):
+    directory = write_sigmf(tmp_path / "s", "r", counts(1000), [])
+    meta, data = directory / "r.sigmf-meta", directory / "r.sigmf-data"
+    text = meta.read_text()
+    data.write_bytes(data.read_bytes()[:-3])
+    with pytest.raises(RecordingError, match="integer number of samples"):
+        open_recording(directory)
+    data.unlink()
+    with pytest.raises(RecordingError, match="file of samples beside it is missing"):
+        open_recording(directory)
+    meta.write_text(text[:50])
+    with pytest.raises(RecordingError, match="not valid JSON"):
+        open_recording(directory)
+    meta.write_text('{"global": {}}')
+    with pytest.raises(RecordingError, match="cannot read"):
+        open_recording(directory)
+
+
+def test_sigmf_receivers_that_differ(tmp_path):
+    write_sigmf(tmp_path / "s", "r0", counts(10), [])
+    write_sigmf(tmp_path / "s", "r1", counts(10), [], rate=2e6)
+    with pytest.raises(RecordingError, match="`r1` and `r0` differ in rate: 2000000 and 1000000"):
+        open_recording(tmp_path / "s")
+
+
+def test_sigmf_archive_is_named(tmp_path):
+    (tmp_path / "a.sigmf").write_bytes(b"x")
+    with pytest.raises(RecordingError, match="unpack it"):
+        open_recording(tmp_path / "a.sigmf")
+
+
+# -- conversion ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["int16", "complex64"])
+def native(request, tmp_path):
+    """A native recording with gaps, at a rate that is no whole number, with a late block in another hour."""
+    x = counts(9000) if request.param == "int16" else counts(9000).astype(np.float32) / 32768
+    path = tmp_path / "native.h5"
+    with RecordingWriter(
+        path, scenario=SCENARIO, receiver_ids=["H01_r1", "H01_r0"], sample_rate=Fraction(10**7, 3),
+        centre_frequency_hz=100e6, sample_format=request.param, full_scale=32767 if request.param == "int16" else 1.0,
+        provenance={},
+    ) as writer:  # fmt: skip
+        writer.write("H01_r0", EPOCH, x[:5000])
+        writer.write("H01_r0", EPOCH + 6000, x[5000:6000])
+        writer.write("H01_r1", EPOCH + 17, x)
+        writer.write("H01_r1", EPOCH + 4 * 10**9, x[:100])
+    with open_recording(path) as recording:
+        yield recording
+
+
+@pytest.mark.parametrize("format", ["rfpose-iq", "digital-rf", "sigmf"])
+def test_conversion_keeps_samples_times_and_gaps(native, tmp_path, format):
+    progress = []
+    convert(native, tmp_path / "out", format=format, on_progress=lambda done, total: progress.append((done, total)))
+    convert_back = tmp_path / "back.h5"
+    with open_recording(tmp_path / "out") as middle:
+        convert(middle, convert_back, format="rfpose-iq")
+    for path in (tmp_path / "out", convert_back):
+        with open_recording(path) as got:
+            assert set(got.receiver_ids) == set(native.receiver_ids)
+            assert got.sample_rate == native.sample_rate
+            assert got.centre_frequency_hz == native.centre_frequency_hz
+            assert got.sample_format == native.sample_format
+            assert got.scenario is not None
+            assert got.scenario.to_toml() == SCENARIO.to_toml()
+            for name in native.receiver_ids:
+                assert np.array_equal(got.blocks(name), native.blocks(name))
+                for start, count in native.blocks(name).tolist():
+                    assert got.read(name, start, count).tobytes() == native.read(name, start, count).tobytes()
+    assert progress[-1] == (15_100, 15_100)
+    assert progress == sorted(progress)
+
+
+@pytest.mark.parametrize("format", ["rfpose-iq", "digital-rf", "sigmf"])
+def test_conversion_refuses_and_replaces(native, tmp_path, format):
+    out = tmp_path / "out"
+    convert(native, out, format=format)
+    with pytest.raises(RecordingError, match="exists already.*--force"):
+        convert(native, out, format=format)
+    convert(native, out, format=format, overwrite=True)
+    with open_recording(out) as got:
+        assert got.covers("H01_r1", EPOCH + 17, 9000)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["native.h5", "out"]
+
+
+def test_conversion_never_replaces_a_directory_that_is_no_recording(native, tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter1.txt").write_text("years of work")
+    for format in ("digital-rf", "sigmf"):
+        with pytest.raises(RecordingError, match="not a recording is never replaced"):
+            convert(native, tmp_path / "thesis", format=format, overwrite=True)
+    with pytest.raises(RecordingError, match="is a directory"):
+        convert(native, tmp_path / "thesis", format="rfpose-iq", overwrite=True)
+    assert (tmp_path / "thesis" / "chapter1.txt").read_text() == "years of work"
+
+
+def test_conversion_arguments(native, tmp_path):
+    with pytest.raises(InvalidInputError, match="`format` must be one of"):
+        convert(native, tmp_path / "out", format="wav")
+    with pytest.raises(RecordingError, match="source and target are the same"):
+        convert(native, native.path, format="rfpose-iq", overwrite=True)
+    with pytest.raises(RecordingError, match="does not exist; make it first"):
+        convert(native, tmp_path / "no" / "out", format="sigmf")
+
+
+def test_interrupted_conversion_leaves_nothing(native, tmp_path):
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    for format in ("rfpose-iq", "digital-rf", "sigmf"):
+        with pytest.raises(KeyboardInterrupt):
+            convert(native, tmp_path / "out", format=format, on_progress=stop)
+    assert [p.name for p in tmp_path.iterdir()] == ["native.h5"]
