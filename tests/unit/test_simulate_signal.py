@@ -277,14 +277,25 @@ def test_drifts_are_random_walks_of_the_stated_rate():
         transmitter_phase_drift_rad_per_sqrt_h=0.2,
     )
     phi, delay_s = sim.truth.transmitter_phase_rad[..., 0], sim.truth.receiver_delay_s
-    assert np.all((phi > -np.pi) & (phi <= np.pi))
     step = np.angle(np.exp(1j * np.diff(phi, axis=0))) / (0.2 * np.sqrt(30.0 / 3600.0))
     for steps in (step, np.diff(delay_s, axis=0) / (5e-12 * np.sqrt(0.5))):
         z = (np.mean(steps**2) - 1.0) / np.sqrt(2.0 / steps.size)  # chi-square
         assert abs(z) < 4.0
         assert abs(np.mean(steps)) * np.sqrt(steps.size) < 4.0
-    many = [make(seed=s, receiver_delay_s=1e-9).truth.receiver_delay_s[0] for s in range(100)]
-    assert abs(np.mean(np.square(many)) / 1e-18 - 1.0) < 4.0 * np.sqrt(2.0 / 400)
+
+
+def test_draws_over_many_seeds_have_the_stated_distribution():
+    n_seed = 100
+    sims = [make(seed=s, receiver_delay_s=1e-9, clock_offset_ppm=5.0, frame_count=1) for s in range(n_seed)]
+    delay_s = np.array([s.truth.receiver_delay_s[0] for s in sims])
+    assert abs(np.mean(delay_s**2) / 1e-18 - 1.0) < 4.0 * np.sqrt(2.0 / delay_s.size)
+    phi = np.array([s.truth.transmitter_phase_rad[0] for s in sims])
+    assert np.all((phi > -np.pi) & (phi <= np.pi))
+    ppm = np.array([s.truth.clock_ppm[[0, 3]] for s in sims])
+    assert np.max(np.abs(ppm)) <= 5.0
+    for uniform in (phi / np.pi, np.array([s.draws.carrier_phase_rad for s in sims]) / np.pi - 1.0, ppm / 5.0):
+        assert abs(np.mean(uniform)) < 4.0 / np.sqrt(3.0 * uniform.size)
+        assert abs(np.mean(uniform**2) - 1.0 / 3.0) < 4.0 * np.sqrt(4.0 / 45.0 / uniform.size)
 
 
 @pytest.mark.parametrize("interval_s", [0.0, N / RATE])
