@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -481,3 +482,17 @@ def test_long_frames_come_in_bounded_pieces_without_a_seam():
     clean = [c.samples for c in make(text=text, **QUIET) if c.receiver_id == "r2"]
     a, b = (p - q for p, q in zip(noisy[:2], clean[:2], strict=True))
     assert abs(np.mean(a * b)) < 4 * np.var(a) / np.sqrt(a.size)  # each piece has noise of its own
+
+
+def test_memory_does_not_grow_with_length():
+    text = SITE.replace("frame_samples = 20_000", "frame_samples = 16_777_216")
+    sim = make(text=text, frame_count=1000)
+    tracemalloc.start()
+    try:
+        n_sample = sum(len(chunk.samples) for chunk in itertools.islice(sim, 20))
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert n_sample == 20 * simulator.CHUNK_SAMPLES
+    # a frame of int16 would be 67 MB; a chunk with its buffers is 4 MB, a few of them at a time
+    assert peak_bytes < 40e6
