@@ -7,13 +7,13 @@ numbers. A public function in front of each checks, shapes and names.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 
 __all__ = ["kernel", "kernel_fast", "kernel_inline", "kernel_parallel", "kernel_parallel_fast"]
 
-F = TypeVar("F", bound=Callable[..., Any])
+Function = Callable[..., Any]
 
 # OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
 numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
@@ -23,26 +23,26 @@ _REORDER = {"reassoc", "contract", "arcp", "nsz"}
 _COMMON: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
-def kernel(function: F) -> F:
+def kernel(function: Function) -> Function:
     """Compile a serial kernel with IEEE arithmetic."""
     return numba.njit(**_COMMON)(function)  # type: ignore[no-any-return]
 
 
-def kernel_inline(function: F) -> F:
+def kernel_inline(function: Function) -> Function:
     """Compile a small piece that is inlined into the kernels that call it."""
     return numba.njit(**_COMMON, inline="always")(function)  # type: ignore[no-any-return]
 
 
-def kernel_parallel(function: F) -> F:
+def kernel_parallel(function: Function) -> Function:
     """Compile a kernel whose ``numba.prange`` loops run on all cores."""
     return numba.njit(**_COMMON, parallel=True)(function)  # type: ignore[no-any-return]
 
 
-def kernel_fast(function: F) -> F:
+def kernel_fast(function: Function) -> Function:
     """Compile a serial kernel whose sums may be reordered; NaN keeps its meaning."""
     return numba.njit(**_COMMON, fastmath=_REORDER)(function)  # type: ignore[no-any-return]
 
 
-def kernel_parallel_fast(function: F) -> F:
+def kernel_parallel_fast(function: Function) -> Function:
     """Compile a parallel kernel whose sums may be reordered; NaN keeps its meaning."""
     return numba.njit(**_COMMON, parallel=True, fastmath=_REORDER)(function)  # type: ignore[no-any-return]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_fast, kernel_parallel
+from rfpose.jit import kernel, kernel_fast
 
 
 @kernel_fast
@@ -50,19 +49,19 @@ def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
             im[j] += i * gi[j] + q * gr[j]
 
 
-@kernel_parallel
+@kernel
 def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
     """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
     n_tap = n_fold * period
-    for k in numba.prange(n_block):
+    for k in range(n_block):
         _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
 
 
-@kernel_parallel
+@kernel
 def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
     """Like `fold_i16` for (sample,) complex64."""
     n_tap = n_fold * period
-    for k in numba.prange(n_block):
+    for k in range(n_block):
         _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
 
 
@@ -98,13 +97,13 @@ def _count_i16(flat, limit):
     return n_clip, n_fill
 
 
-@kernel_parallel
+@kernel
 def inspect_i16(flat, limit, segment):
     """Return (energy, clipped, fill, samples in all-zero segments); ``limit`` is full scale in counts."""
     n_part = (flat.size // 2 + segment - 1) // segment
     energy = np.zeros(n_part)
     count = np.zeros((n_part, 3), np.int64)
-    for p in numba.prange(n_part):
+    for p in range(n_part):
         part = flat[2 * p * segment : min(2 * (p + 1) * segment, flat.size)]
         e, lowest, highest = _segment_i16(part)
         energy[p] = e
@@ -135,13 +134,13 @@ def _segment_f32(flat, limit):
     return energy, n_clip, n_bad, n_zero
 
 
-@kernel_parallel
+@kernel
 def inspect_f32(flat, limit, segment):
     """Return (energy, clipped, not finite, samples in all-zero segments) over interleaved float32 I and Q."""
     n_part = (flat.size // 2 + segment - 1) // segment
     energy = np.zeros(n_part)
     count = np.zeros((n_part, 3), np.int64)
-    for p in numba.prange(n_part):
+    for p in range(n_part):
         part = flat[2 * p * segment : min(2 * (p + 1) * segment, flat.size)]
         e, n_clip, n_bad, n_zero = _segment_f32(part, limit)
         energy[p] = e
@@ -153,7 +152,7 @@ def inspect_f32(flat, limit, segment):
 
 
 @kernel_fast
-def coherent_power(stream, cycles_per_ppm_hop, weight, offset_ppm, out):
+def coherent_power(stream, cycles_per_ppm_hop, offset_ppm, out):
     """Power of every line added up over blocks, for each candidate clock offset.
 
     ``stream`` (line, block) already turned back by the nominal frequencies, ``cycles_per_ppm_hop`` (line,) cycles a
@@ -174,21 +173,8 @@ def coherent_power(stream, cycles_per_ppm_hop, weight, offset_ppm, out):
                 t = ar * sr - ai * si + z.real
                 ai = ar * si + ai * sr + z.imag
                 ar = t
-            total += weight[m] * (ar * ar + ai * ai)
+            total += ar * ar + ai * ai
         out[c] = total
-
-
-@kernel
-def turn_back(block, cycles_hop, out):
-    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128."""
-    n_line, n_block = out.shape
-    for m in range(n_line):
-        angle = -2.0 * math.pi * (cycles_hop[m] - math.floor(cycles_hop[m]))
-        step = complex(math.cos(angle), math.sin(angle))
-        phasor = complex(1.0, 0.0)
-        for k in range(n_block):
-            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor
-            phasor *= step
 
 
 @kernel
@@ -202,6 +188,48 @@ def dirichlet(cycles, n):
         size = math.sin(half * n) / math.sin(half)
     angle = half * (n - 1)
     return complex(size * math.cos(angle), size * math.sin(angle))
+
+
+@kernel
+def _phasor(cycles):
+    angle = 2.0 * math.pi * (cycles - math.floor(cycles))
+    return complex(math.cos(angle), math.sin(angle))
+
+
+@kernel
+def turn_back(block, cycles_hop, out):
+    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128."""
+    n_line, n_block = out.shape
+    for m in range(n_line):
+        step = _phasor(-cycles_hop[m])
+        phasor = complex(1.0, 0.0)
+        for k in range(n_block):
+            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor
+            phasor *= step
+
+
+@kernel
+def turn(stream, cycles_hop, out):
+    """Turn (line, block) on by ``cycles_hop`` a block."""
+    n_line, n_block = out.shape
+    for m in range(n_line):
+        step = _phasor(cycles_hop[m])
+        phasor = complex(1.0, 0.0)
+        for k in range(n_block):
+            out[m, k] = stream[m, k] * phasor
+            phasor *= step
+
+
+@kernel
+def cosine_sum_response(cycles, n, window, out):
+    """Sum of w[i]·exp(j2π·cycles·i) with w[i] = Σ_h a_h cos(2πh(i + ½)/n), for each frequency."""
+    for m in range(cycles.size):
+        total = window[0] * dirichlet(cycles[m], n)
+        for h in range(1, window.size):
+            half_turn = _phasor(0.5 * h / n)
+            total += 0.5 * window[h] * half_turn * dirichlet(cycles[m] + h / n, n)
+            total += 0.5 * window[h] * half_turn.conjugate() * dirichlet(cycles[m] - h / n, n)
+        out[m] = total
 
 
 @kernel

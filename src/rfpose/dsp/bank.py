@@ -74,11 +74,12 @@ class LineStreams:
     def at_clock(self, plan: LinePlan, from_ppm: float, to_ppm: float) -> LineStreams:
         """Return the streams turned back for another clock offset (templates stay as they were)."""
         cycles = plan.line_cycles(to_ppm)
-        step = -2.0 * np.pi * (cycles - plan.line_cycles(from_ppm)) * self.hop
-        turn = np.exp(1j * step[:, None] * np.arange(self.n_block))
+        back = (plan.line_cycles(from_ppm) - cycles) * self.hop
+        stream = np.empty_like(self.stream)
+        _kernels.turn(self.stream, back, stream)
         return LineStreams(
-            stream=self.stream * turn,
-            tail=self.tail * np.exp(1j * step * self.n_block),
+            stream=stream,
+            tail=self.tail * np.exp(2j * np.pi * back * self.n_block),
             hop=self.hop,
             n_tap=self.n_tap,
             n_tail=self.n_tail,
@@ -92,7 +93,9 @@ class LineStreams:
     def response(self) -> ComplexArray:
         """(line,) response of one block at its start to each line's unit amplitude with phase counted from there."""
         inside = self.cycles - self.shift_cycles - self.template_cycles
-        return _cosine_sum_response(inside, self.n_tap, self.window)
+        out = np.empty(len(inside), np.complex128)
+        _kernels.cosine_sum_response(inside, self.n_tap, np.array(self.window), out)
+        return out
 
 
 class LineBank:
@@ -225,24 +228,3 @@ def _line_matrix(template_cycles: FloatArray, period: int) -> npt.NDArray[np.flo
     top = np.hstack([turn.real, turn.imag])
     bottom = np.hstack([-turn.imag, turn.real])
     return np.ascontiguousarray(np.vstack([top, bottom]), np.float32)
-
-
-def _dirichlet(cycles: FloatArray, n: int) -> ComplexArray:
-    """Sum of exp(j2π·cycles·i) for i = 0 … n−1."""
-    turn = cycles - np.rint(cycles)
-    small = np.abs(turn) < 1e-12
-    half = np.pi * np.where(small, 0.25, turn)
-    size = np.where(small, float(n), np.sin(half * n) / np.sin(half))
-    return np.asarray(size * np.exp(1j * np.pi * turn * (n - 1)))
-
-
-def _cosine_sum_response(cycles: FloatArray, n: int, window: tuple[float, ...]) -> ComplexArray:
-    """Sum of w[i]·exp(j2π·cycles·i) with w[i] = Σ_h a_h cos(2πh(i + ½)/n)."""
-    total = np.zeros(len(cycles), np.complex128)
-    for h, a in enumerate(window):
-        if h == 0:
-            total += a * _dirichlet(cycles, n)
-            continue
-        phase = np.exp(1j * np.pi * h / n)
-        total += 0.5 * a * (phase * _dirichlet(cycles + h / n, n) + phase.conjugate() * _dirichlet(cycles - h / n, n))
-    return total

@@ -47,9 +47,10 @@ def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], p
 def refine_clock(
     streams: LineStreams, plan: LinePlan, clock_ppm: float, range_ppm: float
 ) -> tuple[float, float, FloatArray]:
-    """Refine the clock offset to the maximum of the power that all lines add up to over the frame.
+    """Refine the clock offset to the maximum of the power that the carriers add up to over the frame.
 
-    Maximum likelihood for lines of unknown complex amplitude that do not overlap, in white noise.
+    Maximum likelihood for carriers of unknown complex amplitude that do not overlap, in white noise. The sidebands
+    would add a few percent at three times the work.
 
     Parameters
     ----------
@@ -67,9 +68,10 @@ def refine_clock(
     power : (3,)
         Coherent power at the refined offset, incoherent power, number of blocks.
     """
-    slope_hop = plan.cycles_per_ppm() * streams.hop
+    every = 1 + 2 * plan.n_tone
+    carrier = streams.stream[::every]
+    slope_hop = plan.cycles_per_ppm()[::every] * streams.hop
     n_block = streams.n_block
-    weight = np.ones(len(slope_hop))
     steepest = float(np.max(np.abs(slope_hop)))
     step = 0.25 / (n_block * steepest) if n_block > 1 else np.inf
     reach = min(range_ppm, 0.45 / steepest)
@@ -78,20 +80,20 @@ def refine_clock(
     if n_side:
         candidate = step * np.arange(-n_side, n_side + 1)
         score = np.empty(len(candidate))
-        _kernels.coherent_power(streams.stream, slope_hop, weight, candidate, score)
+        _kernels.coherent_power(carrier, slope_hop, candidate, score)
         offset = float(candidate[int(np.argmax(score))])
     curvature = np.nan
     if n_block > 1:
         small = 0.1 * step
         score = np.empty(3)
         for _ in range(3):
-            _kernels.coherent_power(streams.stream, slope_hop, weight, offset + small * np.arange(-1.0, 2.0), score)
+            _kernels.coherent_power(carrier, slope_hop, offset + small * np.arange(-1.0, 2.0), score)
             bend = score[0] - 2.0 * score[1] + score[2]
             if not bend < 0.0:
                 break
             offset -= 0.5 * small * float(score[2] - score[0]) / float(bend)
             curvature = -0.5 * float(bend) / small**2
     coherent = np.empty(1)
-    _kernels.coherent_power(streams.stream, slope_hop, weight, np.array([offset]), coherent)
-    incoherent = float(np.sum(np.abs(streams.stream) ** 2)) * n_block
+    _kernels.coherent_power(carrier, slope_hop, np.array([offset]), coherent)
+    incoherent = float(np.sum(np.abs(carrier) ** 2)) * n_block
     return clock_ppm + offset, curvature, np.array([coherent[0], incoherent, float(n_block)])

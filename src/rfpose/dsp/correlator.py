@@ -77,12 +77,15 @@ def _residual(streams: LineStreams, amplitude: ComplexArray) -> ComplexArray:
     inside = streams.cycles[:, None] - streams.shift_cycles - streams.template_cycles[None, :]
     response = np.empty(inside.shape, np.complex128)
     _kernels.dirichlet_matrix(inside, streams.hop, response)
-    # streams are turned back by each line's own frequency; turn the model of every line into line l's frame
-    start = streams.hop * np.arange(streams.n_block) - streams.centre
-    line_turn = np.exp(2j * np.pi * np.outer(streams.cycles, start))
-    back = line_turn.conj() * np.exp(-2j * np.pi * streams.cycles * streams.centre)[:, None]
-    model = response.T @ (amplitude[:, None] * line_turn)
-    return np.asarray(streams.stream - model * back)
+    # Streams are turned back by each line's own frequency. Turn the model of every line from there into absolute
+    # time, pass it through the response, and turn it back by line l's frequency.
+    start_turn = np.exp(-2j * np.pi * streams.cycles * streams.centre)
+    constant = np.repeat((amplitude * start_turn)[:, None], streams.n_block, axis=1)
+    absolute = np.empty_like(constant)
+    _kernels.turn(constant, streams.cycles * streams.hop, absolute)
+    model = np.empty_like(constant)
+    _kernels.turn(response.T @ absolute, -streams.cycles * streams.hop, model)
+    return np.asarray(streams.stream - model)
 
 
 def _clock_step(streams: LineStreams, amplitude: ComplexArray, left: ComplexArray, cycles_per_ppm: FloatArray) -> float:

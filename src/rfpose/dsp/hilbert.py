@@ -35,7 +35,7 @@ ComplexArray = npt.NDArray[np.complex128]
 def centred_streams(streams: LineStreams) -> ComplexArray:
     """(line, block) amplitude of each line over time, its phase referred to the frame's centre."""
     turn = np.exp(2j * np.pi * streams.cycles * streams.centre) / streams.response()
-    return streams.stream * turn[:, None]
+    return np.asarray(streams.stream * turn[:, None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ def unit_phasor_variance(relative_noise: FloatArray, streams: LineStreams) -> Fl
 def unit_phasor_phase(tone: ComplexArray) -> FloatArray:
     """Phase of the mean unit phasor over the last axis (§3.1.3) [rad]."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.angle(np.mean(tone / np.abs(tone), axis=-1))
+        return np.asarray(np.angle(np.mean(tone / np.abs(tone), axis=-1)))
 
 
 def dot_phase(tone: ComplexArray, reference: ComplexArray) -> FloatArray:

@@ -30,6 +30,8 @@ class LinePlan:
         Carrier offsets [Hz].
     tone_hz : (tone,)
         Ranging tones [Hz].
+    line_hz : (transmitter × line,)
+        Every line [Hz]: of each transmitter the carrier, then upper and lower sideband of each tone.
     sample_rate_hz, centre_frequency_hz
         Of the recording [Hz].
     clock_search_ppm
@@ -41,6 +43,7 @@ class LinePlan:
 
     carrier_hz: FloatArray
     tone_hz: FloatArray
+    line_hz: FloatArray
     sample_rate_hz: float
     centre_frequency_hz: float
     clock_search_ppm: float
@@ -70,9 +73,11 @@ class LinePlan:
             raise InvalidInputError("`carrier_hz` and `tone_hz` must each hold at least one frequency")
         if np.max(np.abs(carrier)) + np.max(tone) >= rate / 2.0:
             raise InvalidInputError("`carrier_hz` ± `tone_hz` must lie inside ±`sample_rate_hz`/2")
+        offset = np.array([0.0, *(sign * f for f in tone for sign in (1.0, -1.0))])
         return cls(
             carrier_hz=read_only(carrier),
             tone_hz=read_only(tone),
+            line_hz=read_only((carrier[:, None] + offset).ravel()),
             sample_rate_hz=rate,
             centre_frequency_hz=float(centre_frequency_hz),
             clock_search_ppm=float(clock_search_ppm),
@@ -100,14 +105,6 @@ class LinePlan:
     def n_tone(self) -> int:
         """Number of tones."""
         return len(self.tone_hz)
-
-    @property
-    def line_hz(self) -> FloatArray:
-        """(transmitter × line,) every line at nominal frequency [Hz]: carrier, then upper, lower of each tone."""
-        offset = [0.0]
-        for tone in self.tone_hz:
-            offset += [tone, -tone]
-        return np.asarray((self.carrier_hz[:, None] + np.array(offset)).ravel())
 
     @property
     def smallest_gap_hz(self) -> float:
