@@ -38,7 +38,7 @@ def sound(tmp_path):
                 transmitter_ids=("T",),
                 normal_enu=np.ones((1, 1, 3)),
                 receiver_enu_m=np.ones((1, 2, 3)),
-            )  # fmt: skip
+            )
         )
     return path
 
@@ -59,7 +59,7 @@ def test_not_hdf5(tmp_path, content, words):
 
 
 def test_directory_of_something_else(tmp_path):
-    with pytest.raises(RecordingError, match="neither Digital RF channels .* nor SigMF"):
+    with pytest.raises(RecordingError, match=r"neither Digital RF channels .* nor SigMF"):
         open_recording(tmp_path)
 
 
@@ -74,7 +74,7 @@ def test_truncated(sound, keep):
 def test_other_hdf5(tmp_path):
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["temperature"] = np.arange(5.0)
-    with pytest.raises(RecordingError, match="an HDF5 file of another format .*must be 'rfpose-iq', is None"):
+    with pytest.raises(RecordingError, match=r"an HDF5 file of another format .*must be 'rfpose-iq', is None"):
         open_recording(tmp_path / "x.h5")
 
 
@@ -227,7 +227,7 @@ def test_killed_writer_leaves_the_target_alone(tmp_path, existing):
 
 
 def test_no_such_directory(tmp_path):
-    with pytest.raises(RecordingError, match="cannot write: No such file or directory; .*directory exists"), \
+    with pytest.raises(RecordingError, match=r"cannot write: No such file or directory; .*directory exists"), \
             RecordingWriter(
                 tmp_path / "no" / "r.h5", scenario=None, receiver_ids=["a"], sample_rate=Fraction(1),
                 centre_frequency_hz=0.0, sample_format="int16", full_scale=1, provenance={},

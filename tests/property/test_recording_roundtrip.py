@@ -1,5 +1,6 @@
 """Whatever pattern of blocks is written, the same samples and the same gaps come back."""
 
+import itertools
 import tempfile
 from fractions import Fraction
 from pathlib import Path
@@ -42,7 +43,7 @@ def runs_of(indices):
     return runs
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     start=st.integers(0, 2**57),
     first=PIECES,
@@ -86,7 +87,7 @@ def test_bytes_do_not_depend_on_how_the_samples_were_handed_over(cuts):
     edges = [0, *sorted(cuts), 30_000]
     with tempfile.TemporaryDirectory() as directory:
         contents = []
-        for name, pieces in (("one", [(0, 30_000)]), ("many", list(zip(edges, edges[1:], strict=False)))):
+        for name, pieces in (("one", [(0, 30_000)]), ("many", list(itertools.pairwise(edges)))):
             path = Path(directory) / name
             with RecordingWriter(
                 path, scenario=None, receiver_ids=["a"], sample_rate=Fraction(1), centre_frequency_hz=0.0,

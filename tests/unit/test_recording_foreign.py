@@ -152,7 +152,7 @@ def test_drf_subchannel_and_channel_of_one_name(tmp_path):
 
 def test_drf_given_too_deep(tmp_path):
     write_drf(tmp_path / "d", "r0", [(0, counts(10))])
-    with pytest.raises(RecordingError, match="one channel of a Digital RF recording; give `.*/d` instead"):
+    with pytest.raises(RecordingError, match=r"one channel of a Digital RF recording; give `.*/d` instead"):
         open_recording(tmp_path / "d" / "r0")
     with pytest.raises(RecordingError, match="one file of a Digital RF recording"):
         open_recording(next((tmp_path / "d" / "r0").rglob("rf@*.h5")))
@@ -162,7 +162,7 @@ def test_drf_damaged_file(tmp_path, capsys):
     write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
     middle = sorted((tmp_path / "d" / "r0").rglob("rf@*.h5"))[1]
     middle.write_bytes(middle.read_bytes()[:3000])
-    with open_recording(tmp_path / "d") as r, pytest.raises(RecordingError, match="cannot read `r0`: .*truncated"):
+    with open_recording(tmp_path / "d") as r, pytest.raises(RecordingError, match=r"cannot read `r0`: .*truncated"):
         r.blocks("r0")
     assert capsys.readouterr().out == ""
 
@@ -352,7 +352,7 @@ def test_conversion_keeps_samples_times_and_gaps(native, tmp_path, format):
 def test_conversion_refuses_and_replaces(native, tmp_path, format):
     out = tmp_path / "out"
     convert(native, out, format=format)
-    with pytest.raises(RecordingError, match="exists already.*--force"):
+    with pytest.raises(RecordingError, match=r"exists already.*--force"):
         convert(native, out, format=format)
     convert(native, out, format=format, overwrite=True)
     with open_recording(out) as got:

@@ -276,9 +276,13 @@ def test_writer_arguments(tmp_path, changes, words):
     ],
 )
 def test_bad_write_leaves_nothing_behind(tmp_path, call, words):
-    with pytest.raises(InvalidInputError, match=words), writer(tmp_path / "r.h5") as w:
-        w.write("a", 0, counts(100))
-        call(w)
+    def write():
+        with writer(tmp_path / "r.h5") as w:
+            w.write("a", 0, counts(100))
+            call(w)
+
+    with pytest.raises(InvalidInputError, match=words):
+        write()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -290,7 +294,7 @@ def test_writer_outside_with(tmp_path):
 def test_existing_file_is_refused_without_overwrite(tmp_path):
     path = tmp_path / "r.h5"
     path.write_text("mine")
-    with pytest.raises(RecordingError, match="exists already.*--force"):
+    with pytest.raises(RecordingError, match=r"exists already.*--force"):
         writer(path)
     assert path.read_text() == "mine"
     with writer(path, overwrite=True) as w:
@@ -310,9 +314,14 @@ def test_file_that_appears_meanwhile_is_kept(tmp_path):
 def test_exception_keeps_the_old_file(tmp_path):
     path = tmp_path / "r.h5"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError), writer(path, overwrite=True) as w:
-        w.write("a", 0, counts(1000))
-        raise ZeroDivisionError
+
+    def write():
+        with writer(path, overwrite=True) as w:
+            w.write("a", 0, counts(1000))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        write()
     assert [p.name for p in tmp_path.iterdir()] == ["r.h5"]
     assert path.read_text() == "old"
 

@@ -124,6 +124,7 @@ class SigmfRecording(Recording):
 
 def _load(library: Any, meta: Path) -> _Stream:
     with _library_errors(meta):
+        json.loads(meta.read_text(encoding="utf-8"))  # the library leaves the file open where this fails
         file = library.sigmffile.fromfile(meta, skip_checksum=True, autoscale=False)
         file.validate()
         found = file.get_global_info()
@@ -220,11 +221,13 @@ def _index_of_datetime(meta: Path, capture: dict[str, Any], rate: Fraction) -> t
 @contextlib.contextmanager
 def _library_errors(meta: Path) -> Iterator[None]:
     """Turn what the library raises or warns of into one line."""
+    from jsonschema.exceptions import ValidationError  # type: ignore[import-untyped]  # comes with sigmf
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             yield
     except json.JSONDecodeError as error:
         raise RecordingError(f"{meta}: not valid JSON: {error}; copy the file again") from error
-    except (OSError, ValueError, KeyError, TypeError, UserWarning, RuntimeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, UserWarning, RuntimeError, ValidationError) as error:
         raise RecordingError(f"{meta}: cannot read: {str(error).splitlines()[0]}; correct or copy it again") from error
