@@ -95,8 +95,8 @@ class Journal:
             if match is None or int(match[1]) != end:
                 break
             try:
-                with np.load(path, allow_pickle=False) as file:
-                    arrays = {name: file[name] for name in file.files}
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                    arrays = {name: stored[name] for name in stored.files}
             except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 _log.warning("%s is damaged (%s); that part is measured again", path, error)
                 break

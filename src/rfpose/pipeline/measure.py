@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from typing import Any
@@ -135,7 +135,7 @@ def _measure(extractor: ToneExtractor, samples: Samples | LineStatus, clock_ppm:
 
 def _read_ahead(
     recording: Recording, scenario: Scenario, frame_start_index: npt.NDArray[np.int64], rows: range
-) -> Iterator[Samples | LineStatus]:
+) -> Generator[Samples | LineStatus, None, None]:
     """Yield each row's samples, or why there are none, while a thread reads the next; two buffers take turns."""
     n_sample = scenario.radio.frame_samples
     receiver_ids = scenario.receiver_ids

@@ -67,7 +67,8 @@ def draw_field_map(result: Result, path: str | Path, *, evaluation: Evaluation |
     )
     figure.colorbar(dots, ax=axes, label=label, shrink=0.85)
     if not solved.all():
-        axes.scatter(*places[~solved, :2].T, marker="x", color="k", s=80, zorder=4, label="heliostat, not solved")
+        x, y = places[~solved, :2].T
+        axes.scatter(x, y, s=80, marker="x", color="k", zorder=4, label="heliostat, not solved")
     for name, place, value, offset in zip(scenario.heliostat_ids, places, mrad, _behind(measured), strict=True):
         text = f"{name}\n{value:.2f}" if np.isfinite(value) else name
         axes.annotate(text, place[:2], offset, textcoords="offset points", fontsize=7, ha="center", va="center")
@@ -146,12 +147,12 @@ def _spectrum(recording: Recording, scenario: Scenario, receiver_id: str) -> tup
 
 def _widened(power_db: FloatArray) -> FloatArray:
     """Return the largest of each bin and its neighbours, so that a line between two bins shows its level."""
-    return np.maximum.reduce([np.roll(power_db, k) for k in (-2, -1, 0, 1, 2)])
+    return np.asarray(np.maximum.reduce([np.roll(power_db, k) for k in (-2, -1, 0, 1, 2)]))
 
 
 def _first_solved(result: Result) -> npt.NDArray[np.intp]:
     """Return (heliostat,) the first frame in which each was solved, else the first."""
-    return np.argmax(result.poses.status == PoseStatus.OK, axis=0)
+    return np.asarray(np.argmax(result.poses.status == PoseStatus.OK, axis=0))
 
 
 def _rms(values: FloatArray) -> float:
@@ -164,7 +165,8 @@ def _arrows(axes: Axes, places: FloatArray, offset_m: FloatArray) -> None:
     seen = np.isfinite(offset_m).all(axis=1)
     axes.quiver(
         *places[seen, :2].T, *offset_m[seen, :2].T,
-        angles="xy", scale_units="xy", scale=1.0, width=0.003, headwidth=4, color="k", zorder=3, label="measured normal",
+        angles="xy", scale_units="xy", scale=1.0, width=0.003, headwidth=4, color="k", zorder=3,
+        label="measured normal",
     )  # fmt: skip
 
 
@@ -183,7 +185,7 @@ def _behind(normal_enu: FloatArray) -> FloatArray:
 def _mark(axes: Axes, places: FloatArray, names: tuple[str, ...], *, marker: str, label: str) -> None:
     axes.scatter(places[:, 0], places[:, 1], marker=marker, color="#D55E00", s=60, zorder=3, label=label)
     for name, place in zip(names, places, strict=True):
-        axes.annotate(name, place[:2], (6, 4), textcoords="offset points", fontsize=8, color="#A04000")
+        axes.annotate(name, place[:2], (6, -11), textcoords="offset points", fontsize=8, color="#A04000")
 
 
 def _new_figure(width_inch: float, height_inch: float) -> tuple[Figure, Axes]:

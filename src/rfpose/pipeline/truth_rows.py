@@ -53,6 +53,5 @@ def _taken(array: Any, index: npt.NDArray[np.int64], *, axis: int) -> Any:
     shape = [len(index) if i == axis else n for i, n in enumerate(array.shape)]
     out = np.full(shape, np.nan)
     known = np.flatnonzero(index >= 0)
-    place = (slice(None),) * axis
-    out[(*place, known)] = array[(*place, index[known])]
+    np.moveaxis(out, axis, 0)[known] = np.moveaxis(array, axis, 0)[index[known]]
     return out
