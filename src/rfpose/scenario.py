@@ -236,6 +236,13 @@ class Scenario(_Record):
     heliostat: tuple[Heliostat, ...] = ()
     simulation: Simulation = Simulation()
 
+    def __eq__(self, other: object) -> bool:
+        # not pydantic's own comparison, which trips over the cached arrays
+        return isinstance(other, Scenario) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash(self.to_toml())
+
     # -- arrays ------------------------------------------------------------------------------------------
 
     @cached_property
@@ -414,6 +421,14 @@ def _check_simulation_names(s: Scenario) -> None:
             raise ValueError(f"simulation.dropped names receiver `{dropout.receiver}`, which does not exist")
 
 
+def _check_clock_can_be_found(s: Scenario) -> None:
+    if s.simulation.clock_offset_ppm > s.radio.clock_search_ppm:
+        raise ValueError(
+            f"simulation.clock_offset_ppm {s.simulation.clock_offset_ppm:g} lies outside what is searched, "
+            f"radio.clock_search_ppm {s.radio.clock_search_ppm:g}; raise the latter"
+        )
+
+
 _CONSISTENCY: tuple[Callable[[Scenario], None], ...] = (
     _check_ids,
     _check_transmitters_apart,
@@ -421,6 +436,7 @@ _CONSISTENCY: tuple[Callable[[Scenario], None], ...] = (
     _check_lines_in_band,
     _check_lines_apart,
     _check_simulation_names,
+    _check_clock_can_be_found,
 )
 
 _LENGTH_KEYS = frozenset(

@@ -1,0 +1,35 @@
+"""What holds for the tree as a whole."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+
+
+def test_import_is_light():
+    code = "import sys, rfpose; print(*[m for m in ('numpy', 'numba', 'h5py', 'PySide6') if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == ""
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT / "src")))
+def test_numba_stays_behind_its_door(path):
+    text = path.read_text()
+    if path.name == "jit.py":
+        return
+    assert not re.search(r"@(numba\.)?(njit|jit)\b", text), "use the decorators of rfpose.jit"
+    if path.name != "_kernels.py":
+        assert not re.search(r"^\s*@kernel", text, re.M), "kernels live in _kernels.py"
+    else:
+        assert not re.search(r"^\s*raise\b|\bopen\(|np\.random", text, re.M), "a kernel does not raise, read or draw"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT / "src")))
+def test_only_the_command_line_prints(path):
+    if "cli" not in path.parts:
+        assert not re.search(r"^\s*print\(", path.read_text(), re.M)
