@@ -258,9 +258,9 @@ def figure_6(runs: int, rng: np.random.Generator, track: Track) -> Figure:
 
 ESTIMATOR_SAMPLES = 4096
 ESTIMATOR_SPC = 10.0
-ESTIMATOR_BANDWIDTH, ESTIMATOR_EDGE = 0.0185, 150
-"""Of the band-pass before the Hilbert transform: width over f_s/2 (the tone ±4.6 % of its frequency), and samples
-left out at each end. The noise far below the tone's threshold, at −20 dB, tells the width; the few per cent lost at
+ESTIMATOR_BANDWIDTH, ESTIMATOR_EDGE = 0.02, 150
+"""Of the band-pass before the Hilbert transform: width over f_s/2 (the tone ±5 % of its frequency), and samples
+left out at each end. The error at −20 dB, below the threshold, tells the width; the few per cent lost at
 high ratios tell the edge."""
 
 _HALF = ESTIMATOR_BANDWIDTH / 4.0

@@ -202,6 +202,6 @@ def test_r11_estimators_against_the_bound(snr_db):
     for name, expected_mrad in R11_MRAD[snr_db].items():
         # All saw the same noise: relative to the correlator, which is on the bound, most of its chance is gone.
         got_mrad = 1e3 * measured["bound"] * (1.0 if name == "bound" else measured[name] / measured["correlator"])
-        # 4 % is the table's own uncertainty; what is left of this test's is 0.4 %, at the threshold 2 %
-        own = 0.01 if snr_db >= 0 else 0.02 if snr_db == -10 else 0.05
+        # 4 % is the table's own uncertainty; to it comes this test's, larger at and below the threshold
+        own = 0.01 if snr_db >= 0 else 0.02 if snr_db == -10 else 0.04
         assert got_mrad == pytest.approx(expected_mrad, rel=0.04 + own), name
