@@ -300,9 +300,10 @@ def _invert(planar: float, ws: FloatArray) -> None:
 
 
 @kernel_fast
-def _step(tolerance2: float, ws: FloatArray) -> float:
+def _step(tolerance2: float, relax: float, ws: FloatArray) -> float:
     """Take each active lane's Gauss-Newton step and return how many lanes are still on their way.
 
+    ``relax`` below one takes part of each step: where residuals are large, full steps can swing to and fro.
     A step longer than the transmitters' extent is shortened to it. A lane has arrived when its next step, foretold
     from the last two as of a sequence that converges linearly (near the solution it does better), is below the
     tolerance in standard deviations, or when this one was below what float64 resolves.
@@ -321,7 +322,7 @@ def _step(tolerance2: float, ws: FloatArray) -> float:
         sz = -(ws[QXZ + lane] * hx + ws[QYZ + lane] * hy + ws[QZZ + lane] * hz)
         in_sigma2 = -(sx * hx + sy * hy + sz * hz)
         length2 = sx * sx + sy * sy + sz * sz
-        shorten = ws[ACTIVE + lane] / math.sqrt(max(length2, 1.0))
+        shorten = relax * ws[ACTIVE + lane] / math.sqrt(max(length2, 1.0))
         ws[X + lane] += shorten * sx
         ws[Y + lane] += shorten * sy
         ws[Z + lane] += shorten * sz
@@ -354,6 +355,7 @@ def iterate_group(
     planar: float,
     max_iteration: int,
     tolerance2: float,
+    relax: float,
     n_min: int,
     ws: FloatArray,
 ) -> None:
@@ -365,7 +367,7 @@ def iterate_group(
     for _ in range(max_iteration):
         _linearise(transmitter, delta, w, ws)
         _invert(planar, ws)
-        if not _step(tolerance2, ws) > 0.0:
+        if not _step(tolerance2, relax, ws) > 0.0:
             break
 
 
@@ -520,6 +522,7 @@ def locate_rows(
     planar: float,
     max_iteration: int,
     tolerance2: float,
+    relax: float,
     n_min: int,
     n_chunk: int,
     position: FloatArray,
@@ -555,7 +558,7 @@ def locate_rows(
                 start_group(transmitter, delta, w, planar, ws)
             else:
                 start_given(start, first, n_lane, n_transmitter, delta, w, transmitter, ws)
-            iterate_group(transmitter, delta, w, planar, max_iteration, tolerance2, n_min, ws)
+            iterate_group(transmitter, delta, w, planar, max_iteration, tolerance2, relax, n_min, ws)
             dop_group(transmitter, delta, w, planar, error, ws)
             residual_group(range_difference.shape[1], transmitter, delta, w, ws, error)
             store_group(

@@ -24,6 +24,8 @@ StatusArray = npt.NDArray[np.int8]
 STEP_TOLERANCE_SIGMA = 1e-6
 # A cold start is taken again from elsewhere when its residuals are less likely than this.
 RESTART_PROBABILITY = 1e-3
+# Part of each Gauss-Newton step taken then: slower, but it converges where full steps swing to and fro.
+RESTART_RELAX = 0.5
 # A solution on the side where receivers are known to be is taken unless its residuals are less likely than this.
 SIDE_PROBABILITY = 1e-6
 
@@ -139,7 +141,7 @@ def locate(
         make the better one. The solution on this side of the plane is taken where it is likely too. None: least
         squares alone decides. Without effect in two dimensions or with a given start.
     max_iteration
-        Gauss-Newton steps before a row is given up.
+        Gauss-Newton steps before a row is given up (twice as many, half as long, from other starts).
     min_probability
         A row whose residuals are less likely than this is marked RESIDUAL; 0 marks none.
 
@@ -253,8 +255,10 @@ class _Problem:
         out[:, :n_axis] = (position_enu_m - self.centre[:n_axis]) / self.scale
         return out
 
-    def solve(self, ranges: FloatArray, weight: FloatArray, start: FloatArray | None) -> dict[str, npt.NDArray[Any]]:
-        """Run the kernel on every row."""
+    def solve(
+        self, ranges: FloatArray, weight: FloatArray, start: FloatArray | None, *, relax: float = 1.0
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Run the kernel on every row; steps are shortened by ``relax``, and more of them allowed."""
         n, n_transmitter = ranges.shape
         n_axis = self.transmitter.shape[1]
         result: dict[str, npt.NDArray[Any]] = {
@@ -272,7 +276,8 @@ class _Problem:
         _kernels.locate_rows(
             even, ranges, weight,
             np.empty((0, 3)) if start is None else self.inside(start),
-            self.scale, self.centre, 3.0 - n_axis, self.max_iteration, STEP_TOLERANCE_SIGMA**2, n_axis + 2,
+            self.scale, self.centre, 3.0 - n_axis,
+            int(self.max_iteration / relax), STEP_TOLERANCE_SIGMA**2, relax, n_axis + 2,
             max(1, min(8 * (os.cpu_count() or 1), n // _kernels.LANES)), *result.values(),
         )  # fmt: skip
         return result
@@ -313,7 +318,7 @@ def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: 
         return
     row_weight = weight if len(weight) == 1 else weight[rows]
     for start in problem.other_starts(result["position_enu_m"][rows]):
-        again = problem.solve(ranges[rows], row_weight, start)
+        again = problem.solve(ranges[rows], row_weight, start, relax=RESTART_RELAX)
         with np.errstate(invalid="ignore"):
             better = (again["status"] == FixStatus.OK) & ~(again["chi2"] >= result["chi2"][rows])
         for name, array in again.items():
@@ -328,7 +333,8 @@ def _take_side(
     if not rows.size:
         return
     row_weight = weight if len(weight) == 1 else weight[rows]
-    again = problem.solve(ranges[rows], row_weight, problem.mirrored(result["position_enu_m"][rows]))
+    start = problem.mirrored(result["position_enu_m"][rows])
+    again = problem.solve(ranges[rows], row_weight, start, relax=RESTART_RELAX)
     limit = _chi2_limit(again["n_transmitter"] - 4, SIDE_PROBABILITY)
     with np.errstate(invalid="ignore"):
         better = (again["status"] == FixStatus.OK) & (sign * problem.height(again["position_enu_m"]) > 0.0)

@@ -1,0 +1,134 @@
+"""Fixes: what is refused, what becomes a marked row."""
+
+import numpy as np
+import pytest
+
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.multilat import FixStatus, dop, locate, position_bound
+
+TRANSMITTER = np.array(
+    [[100, 0, 20], [50, 87, 30], [-50, 87, 20], [-100, 0, 30], [-50, -87, 20], [50, -87, 30], [0, 0, 50]], float
+)
+PLACE = np.array([[10.0, 20.0, 2.0], [-40.0, 5.0, 1.0], [30.0, -60.0, 3.0]])
+RANGES = np.linalg.norm(PLACE[:, None] - TRANSMITTER, axis=-1)
+
+
+def test_exact_ranges_give_the_exact_place_and_clock():
+    fixes = locate(TRANSMITTER, RANGES - 12.5, sigma_m=1e-3)
+    np.testing.assert_allclose(fixes.position_enu_m, PLACE, atol=1e-8)
+    np.testing.assert_allclose(fixes.clock_m, 12.5, atol=1e-8)
+    np.testing.assert_allclose(fixes.residual_m, 0.0, atol=1e-9)
+    np.testing.assert_allclose(fixes.dop, dop(TRANSMITTER, PLACE), rtol=1e-6)
+    np.testing.assert_allclose(fixes.cov_enu_m2, position_bound(TRANSMITTER, PLACE, 1e-3), rtol=1e-6, atol=1e-15)
+    assert fixes.ok.all()
+    assert set(fixes.reasons()) == {"solved"}
+    assert not fixes.position_enu_m.flags.writeable
+
+
+def test_a_bad_row_is_marked_and_the_others_go_on():
+    ranges = np.concatenate([RANGES, RANGES])
+    ranges[1, :3] = np.nan
+    ranges[2] = np.nan
+    ranges[3, 2] += 5.0
+    ranges[4, 0] = np.inf
+    fixes = locate(TRANSMITTER, ranges, sigma_m=1e-3)
+    assert fixes.status.tolist() == [
+        FixStatus.OK,
+        FixStatus.TOO_FEW,
+        FixStatus.NOT_FINITE,
+        FixStatus.RESIDUAL,
+        FixStatus.OK,
+        FixStatus.OK,
+    ]
+    assert fixes.n_transmitter.tolist() == [7, 4, 0, 7, 6, 7]
+    assert np.isnan(fixes.position_enu_m[[1, 2]]).all()
+    assert np.isnan(fixes.cov_enu_m2[[1, 2]]).all()
+    assert np.isfinite(fixes.position_enu_m[[0, 3, 4, 5]]).all()
+    assert np.isnan(fixes.residual_m[4, 0])
+    assert all(fixes.reasons())
+
+
+def test_transmitters_coplanar_with_the_receiver_are_marked():
+    flat = TRANSMITTER * [1.0, 1.0, 0.0]
+    place = np.array([[10.0, 20.0, 0.0], [-30.0, 10.0, 0.0]])
+    ranges = np.linalg.norm(place[:, None] - flat, axis=-1)
+    fixes = locate(flat, ranges, sigma_m=1e-3)
+    assert np.isin(fixes.status, [FixStatus.SINGULAR, FixStatus.WEAK_GEOMETRY, FixStatus.NOT_CONVERGED]).all()
+    assert np.isnan(fixes.position_enu_m).all()
+
+
+def test_transmitters_of_one_height_locate_receivers_below_them():
+    level = TRANSMITTER * [1.0, 1.0, 0.0] + [0.0, 0.0, 30.0]
+    ranges = np.linalg.norm(PLACE[:, None] - level, axis=-1)
+    below = locate(level, ranges, sigma_m=1e-3)
+    above = locate(level, ranges, sigma_m=1e-3, side="above")
+    np.testing.assert_allclose(below.position_enu_m, PLACE, atol=1e-6)
+    np.testing.assert_allclose(above.position_enu_m, [0, 0, 60] + PLACE * [1, 1, -1], atol=1e-6)
+
+
+def test_dilution_over_the_limit_is_marked():
+    limit = float(dop(TRANSMITTER, PLACE[0])) * 0.99
+    fixes = locate(TRANSMITTER, RANGES[:1], sigma_m=1e-3, max_dop=limit)
+    assert fixes.status[0] == FixStatus.WEAK_GEOMETRY
+    assert np.isnan(fixes.position_enu_m).all()
+    assert fixes.dop[0] > limit
+
+
+@pytest.mark.parametrize("start", [PLACE + 30.0, [0.0, 0.0, 2.0]])
+def test_a_given_start_is_used(start):
+    fixes = locate(TRANSMITTER, RANGES, sigma_m=1e-3, start_enu_m=start)
+    np.testing.assert_allclose(fixes.position_enu_m, PLACE, atol=1e-7)
+    few = locate(TRANSMITTER, RANGES, sigma_m=1e-3, start_enu_m=start, max_iteration=1)
+    assert np.all(few.status == FixStatus.NOT_CONVERGED)
+
+
+def test_sigma_may_be_given_in_every_shape_and_nan_leaves_a_transmitter_out():
+    sigma = np.full(7, 1e-3)
+    expected = locate(TRANSMITTER, RANGES, sigma_m=1e-3).cov_enu_m2
+    for shape in (sigma, sigma[None], np.tile(sigma, (3, 1)), np.full((3, 1), 1e-3)):
+        np.testing.assert_allclose(locate(TRANSMITTER, RANGES, sigma_m=shape).cov_enu_m2, expected, rtol=1e-12)
+    sigma[3] = np.nan
+    assert np.all(locate(TRANSMITTER, RANGES, sigma_m=sigma).n_transmitter == 6)
+
+
+def test_no_rows_give_no_fixes():
+    fixes = locate(TRANSMITTER, np.empty((0, 7)), sigma_m=1.0)
+    assert fixes.position_enu_m.shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("transmitter", "match"),
+    [
+        (TRANSMITTER[:4], "5 or more transmitters"),
+        (np.concatenate([TRANSMITTER[:6], TRANSMITTER[2:3]]), "transmitters 2 and 6 at the same"),
+        (np.outer(np.arange(7.0), [1.0, 2.0, 3.0]), "one line"),
+    ],
+)
+def test_a_geometry_without_solution_is_refused(transmitter, match):
+    with pytest.raises(GeometryError, match=match):
+        locate(transmitter, np.zeros((1, len(transmitter))), sigma_m=1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"transmitter_enu_m": TRANSMITTER[:, :1]}, "transmitter_enu_m"),
+        ({"transmitter_enu_m": np.where(TRANSMITTER > 90, np.nan, TRANSMITTER)}, "finite"),
+        ({"range_difference_m": RANGES[:, :5]}, "range_difference_m"),
+        ({"range_difference_m": RANGES[0]}, "range_difference_m"),
+        ({"sigma_m": 0.0}, "sigma_m"),
+        ({"sigma_m": -1.0}, "sigma_m"),
+        ({"sigma_m": np.inf}, "sigma_m"),
+        ({"sigma_m": np.ones(3)}, "sigma_m"),
+        ({"start_enu_m": np.zeros((2, 3))}, "start_enu_m"),
+        ({"max_dop": 0.0}, "max_dop"),
+        ({"max_iteration": 0}, "max_iteration"),
+        ({"min_probability": 1.0}, "min_probability"),
+        ({"side": "left"}, "side"),
+    ],
+)
+def test_mistakes_are_named(change, match):
+    arguments = {"transmitter_enu_m": TRANSMITTER, "range_difference_m": RANGES, "sigma_m": 1e-3}
+    arguments |= change
+    with pytest.raises(InvalidInputError, match=match):
+        locate(arguments.pop("transmitter_enu_m"), arguments.pop("range_difference_m"), **arguments)
