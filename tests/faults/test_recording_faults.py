@@ -127,7 +127,7 @@ SPOILERS = [
     (lambda f: replace(f, BLOCKS, np.ones((2, 3))), "`/receivers/a/blocks` must be int64 of shape"),
     (lambda f: replace(f, BLOCKS, np.ones((2, 2), np.int64)), "`/receivers/a/blocks` must be int64 of shape"),
     (lambda f: replace(f, BLOCKS, np.array([[0, 100_001, 0]])), "row 0 .* does not lie within the 100000 samples"),
-    (lambda f: replace(f, BLOCKS, np.array([[0, 2**62, 2**62]])), "row 0 .* does not lie within the 100000 samples"),
+    (lambda f: replace(f, BLOCKS, np.array([[0, 2**63 - 1, 5]])), "row 0 .* does not lie within the 100000 samples"),
     (lambda f: replace(f, BLOCKS, np.array([[0, 10, 0], [-5, 10, 10]])), "row 1 .* does not lie within"),
     (lambda f: replace(f, BLOCKS, np.array([[0, 10, 0], [9, 10, 10]])), "row 1 starts before row 0 ends"),
 ]

@@ -6,6 +6,7 @@ import sys
 from fractions import Fraction
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -165,6 +166,27 @@ def test_drf_damaged_file(tmp_path, capsys):
     with open_recording(tmp_path / "d") as r, pytest.raises(RecordingError, match=r"cannot read `r0`: .*truncated"):
         r.blocks("r0")
     assert capsys.readouterr().out == ""
+
+
+def test_drf_end_that_the_library_complains_about(tmp_path, capsys, caplog):
+    """The library prints; a command that promises JSON alone on standard output must not."""
+    write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
+    last = max((tmp_path / "d" / "r0").rglob("rf@*.h5"))
+    with h5py.File(last, "w"):
+        pass
+    with open_recording(tmp_path / "d") as r:
+        assert r.blocks("r0").tolist() == [[EPOCH, 20_000]]
+    assert capsys.readouterr().out == ""
+    assert "corrupt file" in caplog.text
+
+
+def test_drf_that_loses_a_file_while_open(tmp_path):
+    write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
+    with open_recording(tmp_path / "d") as r:
+        r.blocks("r0")
+        sorted((tmp_path / "d" / "r0").rglob("rf@*.h5"))[0].unlink()
+        with pytest.raises(RecordingError, match="channel `r0` lost samples after"):
+            r.read("r0", EPOCH + 5_000, 15_000)
 
 
 @pytest.mark.parametrize(("module", "extra"), [("digital_rf", "digital-rf"), ("sigmf", "sigmf")])

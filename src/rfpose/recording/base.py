@@ -204,8 +204,7 @@ class Recording(ABC):
         count
             Number of samples.
         out : (sample, 2)
-            Buffer to fill: C-contiguous, at least ``count`` rows, of `component_dtype`. Reading into the same
-            buffer again and again is several times faster than taking a new one each time.
+            Buffer to fill: C-contiguous, at least ``count`` rows, of `component_dtype`.
 
         Returns
         -------

@@ -127,18 +127,16 @@ class DigitalRfRecording(Recording):
         first = int(self._segments[receiver_id][i_segment, 0]) + skip
         with self._library_errors(channel):
             pieces = self._reader.read(first, first + len(out) - 1, channel, sub_channel=k)
+        if sum(len(piece) for piece in pieces.values()) != len(out):
+            raise RecordingError(
+                f"{self.path}: channel `{channel}` lost samples after {first} since it was opened; open it again when "
+                "nothing writes to it"
+            )
         done = 0
-        for start, piece in pieces.items():
-            if start != first + done:
-                break
+        for piece in pieces.values():
             component = piece.dtype["r"] if piece.dtype.names else piece.real.dtype
             out[done : done + len(piece)] = piece.view(component).reshape(-1, 2)
             done += len(piece)
-        if done != len(out):
-            raise RecordingError(
-                f"{self.path}: channel `{channel}` lost samples from {first + done} on since it was opened; open it "
-                "again when nothing writes to it"
-            )
 
     @contextlib.contextmanager
     def _library_errors(self, place: str) -> Iterator[None]:
