@@ -1,12 +1,11 @@
-"""From IQ to tone phases for a whole recording: frame after frame, receiver after receiver, resumable."""
+"""From IQ to tone phases for a whole recording: receivers side by side, resumable."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
 from rfpose.pipeline._journal import Entry, Journal
+from rfpose.pipeline._workers import worker_pool
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
@@ -103,21 +103,28 @@ def measure_tones(
         clock_ppm[:] = entry[_CLOCK_STATE]
         done = end
     extractor = ToneExtractor(LinePlan.from_scenario(scenario), estimator, full_scale=recording.full_scale)
+    reader = _Reader(recording, scenario, frame_start_index)
     per_entry = max(1, min(_MAX_ENTRY_ROWS, JOURNAL_SAMPLES // scenario.radio.frame_samples))
-    while done < n_row:
-        first, end = done, min(done + per_entry, n_row)
-        with closing(_read_ahead(recording, scenario, frame_start_index, range(first, end))) as frames:
-            for samples in frames:
-                i_frame, i_receiver = divmod(done, n_receiver)
-                found = _measure(extractor, samples, float(clock_ppm[i_receiver]))
-                tones.put(i_frame, i_receiver, found)
-                clock_ppm[i_receiver] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
-                done += 1
-                if on_progress is not None:
+    with worker_pool() as pool:
+        while done < n_row:
+            first, end = done, min(done + per_entry, n_row)
+
+            def measure_receiver(i_receiver: int, first: int = first, end: int = end) -> int:
+                """Measure one receiver's rows of this entry, in order, since its clock is followed."""
+                mine = range(first + (i_receiver - first) % n_receiver, end, n_receiver)
+                for row in mine:
+                    found = _measure(extractor, reader.read(row), float(clock_ppm[i_receiver]))
+                    tones.put(row // n_receiver, i_receiver, found)
+                    clock_ppm[i_receiver] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
+                return len(mine)
+
+            for n_measured in pool.map(measure_receiver, range(n_receiver)):
+                done += n_measured
+                if on_progress is not None and n_measured:
                     on_progress(done, n_row)
-        if journal is not None:
-            entry = {name: values[first:end] for name, values in rows.items()}
-            journal.append(first, end, {**entry, _CLOCK_STATE: clock_ppm})
+            if journal is not None:
+                entry = {name: values[first:end] for name, values in rows.items()}
+                journal.append(first, end, {**entry, _CLOCK_STATE: clock_ppm})
     return tones
 
 
@@ -133,27 +140,30 @@ def _measure(extractor: ToneExtractor, samples: Samples | LineStatus, clock_ppm:
     return extractor.measure(samples, clock_ppm=clock_ppm)
 
 
-def _read_ahead(
-    recording: Recording, scenario: Scenario, frame_start_index: npt.NDArray[np.int64], rows: range
-) -> Generator[Samples | LineStatus, None, None]:
-    """Yield each row's samples, or why there are none, while a thread reads the next; two buffers take turns."""
-    n_sample = scenario.radio.frame_samples
-    receiver_ids = scenario.receiver_ids
-    buffers = [np.empty((n_sample, 2), recording.component_dtype) for _ in range(2)]
+class _Reader:
+    """Reads rows for several threads; each has one buffer, which its next row overwrites."""
 
-    def read(row: int) -> Samples | LineStatus:
-        i_frame, i_receiver = divmod(row, len(receiver_ids))
-        receiver_id, start = receiver_ids[i_receiver], int(frame_start_index[i_frame])
-        if receiver_id not in recording.receiver_ids:
+    def __init__(self, recording: Recording, scenario: Scenario, frame_start_index: npt.NDArray[np.int64]) -> None:
+        self._recording = recording
+        self._receiver_ids = scenario.receiver_ids
+        self._n_sample = scenario.radio.frame_samples
+        self._start_index = frame_start_index
+        self._lock = threading.Lock()  # not every format's library can be called from several threads at once
+        self._own = threading.local()
+
+    def read(self, row: int) -> Samples | LineStatus:
+        """Return one receiver's samples in one frame, or why there are none."""
+        i_frame, i_receiver = divmod(row, len(self._receiver_ids))
+        receiver_id, start = self._receiver_ids[i_receiver], int(self._start_index[i_frame])
+        if receiver_id not in self._recording.receiver_ids:
             return LineStatus.NOT_RECORDED
-        if not recording.covers(receiver_id, start, n_sample):
-            return LineStatus.GAP
-        return recording.read(receiver_id, start, n_sample, out=buffers[row % 2])
+        with self._lock:
+            if not self._recording.covers(receiver_id, start, self._n_sample):
+                return LineStatus.GAP
+            return self._recording.read(receiver_id, start, self._n_sample, out=self._buffer())
 
-    with ThreadPoolExecutor(1, thread_name_prefix="rfpose-read") as pool:
-        ahead: Future[Samples | LineStatus] = pool.submit(read, rows[0])
-        for following in rows[1:]:
-            samples = ahead.result()
-            ahead = pool.submit(read, following)
-            yield samples
-        yield ahead.result()
+    def _buffer(self) -> Samples:
+        if not hasattr(self._own, "buffer"):
+            self._own.buffer = np.empty((self._n_sample, 2), self._recording.component_dtype)
+        buffer: Samples = self._own.buffer
+        return buffer

@@ -1,0 +1,254 @@
+"""The result file: what goes in comes out, equal results are equal bytes, and damage is named."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import replace
+from datetime import UTC, datetime
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rfpose.dsp import TonePhases
+from rfpose.errors import RecordingError
+from rfpose.pipeline import result_file
+from rfpose.pipeline.result_file import (
+    CSV_COLUMNS,
+    KEYS,
+    Result,
+    frame_time,
+    is_result,
+    read_result,
+    summarise,
+    write_poses_csv,
+    write_result,
+)
+from rfpose.pipeline.solve import solve
+from rfpose.scenario import Scenario, load_scenario
+from rfpose.truth import Truth
+
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+START = 1_782_043_200 * 40_000_000
+SETTINGS = {"sample_rate": "40000000", "estimator": "hilbert", "pose": "independent", "version": "0"}
+
+
+def make_result(*, n_frame: int = 2, seed: int = 5) -> Result:
+    """Return a result whose tone phases are exact up to a little noise; one receiver is lost in frame 0."""
+    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
+    data["heliostat"] = data["heliostat"][:2]
+    scenario = Scenario.model_validate(data)
+    rng = np.random.default_rng(seed)
+    normal = np.broadcast_to([0.0, -math.sqrt(0.5), math.sqrt(0.5)], (n_frame, 2, 3))
+    place = np.empty((n_frame, 7, 3))
+    for i, heliostat in enumerate(scenario.heliostat):
+        triangle = np.array(heliostat.receiver_mirror_m)
+        across, up = np.array([1.0, 0.0, 0.0]), np.array([0.0, math.sqrt(0.5), math.sqrt(0.5)])
+        place[:, 3 * i : 3 * i + 3] = heliostat.pivot_enu_m + triangle[:, :1] * across + triangle[:, 1:2] * up
+    place[:, 6:] = scenario.calibration_enu_m
+    distance = np.linalg.norm(place[:, :, None] - scenario.transmitter_enu_m, axis=-1)
+    tones = TonePhases.empty(
+        receiver_ids=scenario.receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        tone_hz=scenario.tone_hz,
+        frame_start_index=START + 40_000_000 * np.arange(n_frame),
+    )
+    sigma = 1e-5
+    tones.phase_rad[..., 0] = -2.0 * np.pi * distance / scenario.wavelength_m[0] + sigma * rng.normal(
+        size=distance.shape
+    )
+    tones.sigma_rad[...] = sigma
+    tones.status[...] = 0
+    tones.phase_rad[0, 1] = tones.sigma_rad[0, 1] = np.nan
+    tones.status[0, 1] = 7
+    truth = Truth(
+        heliostat_ids=scenario.heliostat_ids,
+        receiver_ids=scenario.receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        normal_enu=normal,
+        receiver_enu_m=place,
+        frame_start_index=tones.frame_start_index,
+    )
+    return solve(tones, scenario, settings=SETTINGS, truth=truth)
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return make_result()
+
+
+@pytest.fixture
+def path(result: Result, tmp_path: Path) -> Path:
+    write_result(result, tmp_path / "result.h5")
+    return tmp_path / "result.h5"
+
+
+def _assert_equal(a: Any, b: Any) -> None:
+    for name in a.__dataclass_fields__:
+        x, y = getattr(a, name), getattr(b, name)
+        if hasattr(x, "__dataclass_fields__"):
+            _assert_equal(x, y)
+        elif isinstance(x, np.ndarray):
+            np.testing.assert_array_equal(x, y, err_msg=name)
+        else:
+            assert x == y, name
+
+
+def test_round_trip(result: Result, path: Path) -> None:
+    assert result.poses.status.tolist() == [[1, 0], [0, 0]]
+    _assert_equal(result, read_result(path))
+
+
+def test_read_arrays_are_read_only(path: Path) -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        read_result(path).poses.normal_enu[0, 0, 0] = 1.0
+
+
+def test_round_trip_without_truth(result: Result, tmp_path: Path) -> None:
+    write_result(replace(result, truth=None), tmp_path / "r.h5")
+    assert read_result(tmp_path / "r.h5").truth is None
+
+
+def test_equal_results_are_equal_bytes(path: Path, tmp_path: Path) -> None:
+    write_result(make_result(), tmp_path / "again.h5")
+    assert path.read_bytes() == (tmp_path / "again.h5").read_bytes()
+
+
+def test_every_dataset_says_unit_axes_and_meaning(path: Path) -> None:
+    with h5py.File(path) as file:
+        for name, key in KEYS.items():
+            if name in file:
+                assert file[name].attrs["unit"] == key.unit
+                assert file[name].attrs["axes"].count(",") == file[name].ndim - 1
+                assert file[name].attrs["meaning"] == key.meaning
+        assert file["poses/status"].attrs["codes"].startswith("0 solved; 1 fewer than three")
+
+
+def test_documentation_names_every_key() -> None:
+    text = (DOCS / "result-format.md").read_text()
+    named = set(re.findall(r"^\| `/?([a-z_]+/[a-z0-9_]+)`", text, re.MULTILINE))
+    assert named >= set(KEYS)
+
+
+# -- what is refused -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_truncated(path: Path, kept: float) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    with pytest.raises(RecordingError, match=r"result\.h5: cannot be read as HDF5.*process again"):
+        read_result(path)
+    assert not is_result(path)
+
+
+def test_not_hdf5(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_text("a letter")
+    with pytest.raises(RecordingError, match=r"a\.h5: cannot be read as HDF5"):
+        read_result(tmp_path / "a.h5")
+
+
+def test_absent(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"a\.h5: no such file"):
+        read_result(tmp_path / "a.h5")
+
+
+def test_hdf5_of_another_kind(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(RecordingError, match=r"a\.h5: is no rfpose-result file"):
+        read_result(tmp_path / "a.h5")
+    assert not is_result(tmp_path / "a.h5")
+
+
+def test_version_of_the_future(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = 2
+    with pytest.raises(RecordingError, match="version 2"):
+        read_result(path)
+
+
+@pytest.mark.parametrize("name", ["scenario", "settings", "poses/normal_enu", "tones/phase_rad", "truth/normal_enu"])
+def test_missing(path: Path, name: str) -> None:
+    with h5py.File(path, "r+") as file:
+        del file[name]
+    with pytest.raises(RecordingError, match=f"result.h5: `/{name}` is missing"):
+        read_result(path)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros((2, 2, 3), "S4"), "holds .S4, not float64"),
+        (np.zeros((2, 3, 3)), r"has shape \(2, 3, 3\), not \(frame, heliostat, 3\)"),
+        (np.zeros((3, 2, 3)), r"has shape \(3, 2, 3\)"),
+        (np.zeros((2, 2)), r"has shape \(2, 2\)"),
+        (np.zeros((2, 2, 4)), r"has shape \(2, 2, 4\)"),
+    ],
+)
+def test_mistyped(path: Path, value: np.ndarray, message: str) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["poses/normal_enu"]
+        file["poses/normal_enu"] = value
+    with pytest.raises(RecordingError, match=r"result\.h5: `/poses/normal_enu` " + message):
+        read_result(path)
+
+
+def test_broken_scenario(path: Path) -> None:
+    with h5py.File(path, "r+") as file:
+        del file["scenario"]
+        file["scenario"] = "name = "
+    with pytest.raises(RecordingError, match=r"result\.h5:/scenario: not valid TOML"):
+        read_result(path)
+
+
+def test_failed_write_leaves_the_old_file(path: Path, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = path.read_bytes()
+    monkeypatch.setitem(result_file.KEYS, "poses/absent", KEYS["poses/status"])
+    with pytest.raises(AttributeError, match="absent"):
+        write_result(result, path)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+# -- for people ----------------------------------------------------------------------------------------------
+
+
+def test_frame_time_is_exact_to_the_microsecond() -> None:
+    assert frame_time(START + 40, Fraction(40_000_000)) == datetime(2026, 6, 21, 12, 0, 0, 1, tzinfo=UTC)
+    # a rate that no float holds exactly
+    assert frame_time(10**15, Fraction(10_000_000, 3)).microsecond == 0
+
+
+def test_csv(result: Result, tmp_path: Path) -> None:
+    write_poses_csv(result, tmp_path / "poses.csv")
+    rows = list(csv.DictReader((tmp_path / "poses.csv").read_text().splitlines()))
+    assert list(rows[0]) == list(CSV_COLUMNS)
+    assert [row["heliostat"] for row in rows] == ["H01", "H02"] * 2
+    lost, solved = rows[0], rows[2]
+    assert lost["status"] == "fewer than three receivers of the mirror were located"
+    assert lost["azimuth_deg"] == lost["normal_up"] == lost["normal_sigma_mrad"] == ""
+    assert solved["status"] == "solved"
+    assert solved["time_utc"] == "2026-06-21T12:00:01.000000Z"
+    # 1e-5 rad of phase is 0.64 mm of range: some milliradians on a mirror of 1.7 m
+    assert float(solved["azimuth_deg"]) == pytest.approx(180.0, abs=0.5)
+    assert float(solved["elevation_deg"]) == pytest.approx(45.0, abs=0.5)
+    assert float(solved["normal_sigma_mrad"]) == pytest.approx(1e3 * result.poses.sigma_rad[1, 0], abs=1e-6)
+
+
+def test_summary_counts_mirrors_only(result: Result) -> None:
+    summary = summarise(result)
+    assert summary["fixes"]["solved"] + summary["fixes"]["failed"] == 2 * 6
+    assert summary["poses"] == {
+        "solved": 3,
+        "failed": 1,
+        "reasons": {"fewer than three receivers of the mirror were located": 1},
+    }
+    assert summary["tones"]["failed"] == 10
+    assert result_file.FORMAT == "rfpose-result"
