@@ -45,7 +45,7 @@ def as_float_array(
         Not numeric, wrong shape, or a forbidden value; the message gives name, shape and first bad index.
     """
     try:
-        array = np.ascontiguousarray(np.asarray(value, dtype=np.float64))
+        array = np.asarray(value, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"`{name}` must be numeric, got {value!r:.80}") from error
     wanted = list(shape)
