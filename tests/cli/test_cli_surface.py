@@ -9,11 +9,13 @@ import sys
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import rfpose
 from rfpose.cli import _app
+from rfpose.cli._support import emit_json
 from rfpose.cli.process import ESTIMATOR_NAMES
 
 HEAVY = ("numpy", "scipy", "numba", "h5py", "pydantic", "matplotlib", "rich")
@@ -97,3 +99,8 @@ def test_traceback_only_with_debug(tmp_path: Path) -> None:
     arguments = ["info", str(tmp_path / "absent.h5")]
     assert "Traceback" not in CliRunner().invoke(_app.app, arguments).stderr
     assert "Traceback" in CliRunner().invoke(_app.app, [*arguments, "--debug"]).stderr
+
+
+def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
+    emit_json({"a": float("nan"), "b": np.array([1.0, np.inf]), "c": {"d": (np.float32(0.5), Path("x"), None, True)}})
+    assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.0, None], "c": {"d": [0.5, "x", None, True]}}

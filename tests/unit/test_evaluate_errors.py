@@ -115,9 +115,12 @@ def test_bound_without_snr_is_what_the_result_says(result: Result) -> None:
 
 def test_transmitter_without_signal_does_not_enter_the_bound(result: Result) -> None:
     snr = np.array(_truth(result).tone_snr)
-    snr[:, :, 0] = 1e-15
-    weaker = evaluate(result, replace(_truth(result), tone_snr=snr))
-    assert 1.0 < weaker.bound_mrad / evaluate(result).bound_mrad < 3.0
+    bounds = []
+    for silent in (1e-15, 0.0, np.nan):
+        snr[:, :, 0] = silent
+        bounds.append(evaluate(result, replace(_truth(result), tone_snr=snr)).bound_mrad)
+    assert 1.0 < bounds[0] / evaluate(result).bound_mrad < 3.0
+    assert bounds == pytest.approx([bounds[0]] * 3)
 
 
 def test_failed_poses_are_counted_and_left_out(result: Result) -> None:
@@ -157,6 +160,7 @@ def test_truth_of_a_later_day_is_refused(result: Result) -> None:
 def test_truth_rows_hold_until_the_next(result: Result) -> None:
     truth = _truth(result)
     start = np.array(truth.frame_start_index)
+    assert truth_rows(truth, start).tolist() == [0, 1, 2]
     assert truth_rows(truth, start[[0, 2]] + 5).tolist() == [0, 2]
     assert truth_rows(truth, start[:1] - 1).tolist() == [-1]
     assert truth_rows(replace(truth, frame_start_index=None), start).tolist() == [0, 0, 0]

@@ -24,9 +24,6 @@ from rfpose.truth import Truth
 
 __all__ = ["Evaluation", "HeliostatRow", "Statistics", "evaluate", "read_truth"]
 
-_UNUSABLE_PHASE_RAD = 1.0
-"""A tone whose phase cannot be known better than this is as good as not received."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistics:
@@ -288,7 +285,6 @@ def _noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64]) -> tuple[F
     with np.errstate(invalid="ignore"):
         snr = np.where(snr > 0.0, snr, np.nan)
         phase = phase_bound_rad(scenario.radio.frame_samples, snr)
-        phase = np.where(phase < _UNUSABLE_PHASE_RAD, phase, np.nan)
     own_m = _combine(phase * scenario.wavelength_m / (2.0 * np.pi))
     is_calibration = np.array([row.calibration is not None for row in scenario.receivers], bool)
     calibration_m = _combine(np.moveaxis(own_m[:, is_calibration], 1, -1))
