@@ -230,7 +230,7 @@ def _weights(sigma_m: npt.ArrayLike | float, shape: tuple[int, int], scale: floa
     if np.any(np.isinf(sigma)):
         raise InvalidInputError("`sigma_m` must be finite, or NaN where a transmitter is not to be used")
     n_receiver, n_transmitter = shape
-    if sigma.shape not in ((1,), (n_transmitter,), (1, n_transmitter), (n_receiver, 1), (n_receiver, n_transmitter)):
+    if sigma.shape not in ((), (n_transmitter,), (1, n_transmitter), (n_receiver, 1), (n_receiver, n_transmitter)):
         raise InvalidInputError(
             f"`sigma_m` must be a scalar or have shape (transmitter,) or (receiver, transmitter) = {shape}, "
             f"got {sigma.shape}"

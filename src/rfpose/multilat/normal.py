@@ -185,34 +185,52 @@ def mirror_normal(
 def _plane(
     position: FloatArray, cov: FloatArray, mirror: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
-    """Return unit normals, their covariance, and which rows are on a line; all receivers are there.
-
-    With directions p, q in the plane as linear combinations of the positions, p = Σ a_k R_k and q = Σ b_k R_k,
-    the normal is p × q, and its first-order change follows from dp and dq.
-    """
-    n, n_receiver, _ = position.shape
-    if mirror is not None:
-        a, b = _affine_rows(mirror)
-        a, b = np.broadcast_to(a, (n, n_receiver)), np.broadcast_to(b, (n, n_receiver))
-    elif n_receiver == 3:
-        a = np.broadcast_to([-1.0, 1.0, 0.0], (n, 3))
-        b = np.broadcast_to([-1.0, 0.0, 1.0], (n, 3))
-    else:
-        a, b = _least_squares_rows(position)
+    """Return unit normals, their covariance, and which rows are on a line; all receivers are there."""
     centred = position - position.mean(axis=1, keepdims=True)
-    p = np.einsum("nk,nkx->nx", a, centred)
-    q = np.einsum("nk,nkx->nx", b, centred)
+    scatter = np.einsum("nkx,nky->nxy", centred, centred)
+    size, axes = np.linalg.eigh(np.where(np.isfinite(scatter), scatter, 0.0))
+    flat = ~(size[:, 1] > COLLINEAR**2 * size[:, 2])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if mirror is not None:
+            normal, jacobian = _cross_product(centred, *_affine_rows(mirror))
+        elif position.shape[1] == 3:
+            normal, jacobian = _cross_product(centred, np.array([-1.0, 1.0, 0.0]), np.array([-1.0, 0.0, 1.0]))
+        else:
+            normal, jacobian = _least_squares(centred, size, axes)
+    normal[flat] = np.nan
+    jacobian[flat] = np.nan
+    return normal, jacobian @ cov @ np.swapaxes(jacobian, 1, 2), flat
+
+
+def _cross_product(centred: FloatArray, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return p × q, of length one, and its derivative, for p = Σ a_k R_k and q = Σ b_k R_k in the plane."""
+    p = np.einsum("k,nkx->nx", a, centred)
+    q = np.einsum("k,nkx->nx", b, centred)
     cross = np.cross(p, q)
     length = np.linalg.norm(cross, axis=1)
-    spread = np.linalg.svd(centred, compute_uv=False)
-    flat = ~(spread[:, 1] > COLLINEAR * spread[:, 0]) | ~(length > 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normal = np.where(flat[:, None], np.nan, cross / length[:, None])
-        # d(p × q) = dp × q + p × dq = −[q]× dp + [p]× dq, then only what is across the normal
-        jacobian = np.einsum("nij,nk->nikj", -_skew(q), a) + np.einsum("nij,nk->nikj", _skew(p), b)
-        across = np.eye(3) - normal[:, :, None] * normal[:, None, :]
-        jacobian = across @ jacobian.reshape(n, 3, 3 * n_receiver) / length[:, None, None]
-    return normal, jacobian @ cov @ np.swapaxes(jacobian, 1, 2), flat
+    normal = cross / length[:, None]
+    # d(p × q) = dp × q + p × dq = −[q]× dp + [p]× dq, then only what is across the normal
+    jacobian = np.einsum("nij,k->nikj", -_skew(q), a) + np.einsum("nij,k->nikj", _skew(p), b)
+    across = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / length[:, None, None]
+    return normal, across @ jacobian.reshape(len(centred), 3, -1)
+
+
+def _least_squares(centred: FloatArray, size: FloatArray, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the axis of least scatter, with the sign of the numbering, and its derivative.
+
+    An eigenvector n of S = Σ R_k R_kᵀ moves by Σ_e e (eᵀ dS n)/(λ_n − λ_e) over the other two, e.
+    """
+    normal = axes[:, :, 0]
+    area = np.sum(np.cross(centred, np.roll(centred, -1, axis=1)), axis=1)
+    normal = normal * np.where(np.sum(area * normal, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    height = np.einsum("nkx,nx->nk", centred, normal)
+    jacobian = np.zeros((len(centred), 3, centred.shape[1], 3))
+    for other in (1, 2):
+        e = axes[:, :, other]
+        along = np.einsum("nkx,nx->nk", centred, e)
+        change = along[:, :, None] * normal[:, None, :] + height[:, :, None] * e[:, None, :]
+        jacobian += e[:, :, None, None] * (change / (size[:, 0] - size[:, other])[:, None, None])[:, None]
+    return normal, jacobian.reshape(len(centred), 3, -1)
 
 
 def _skew(v: FloatArray) -> FloatArray:
@@ -227,25 +245,6 @@ def _affine_rows(mirror: FloatArray) -> tuple[FloatArray, FloatArray]:
     centred = mirror - mirror.mean(axis=0)
     inverse = np.linalg.pinv(centred, rcond=COLLINEAR)
     return inverse[0], inverse[1]
-
-
-def _least_squares_rows(position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return coefficients over receivers of two directions that span each row's least-squares plane.
-
-    With plane coordinates (u, v) of the receivers, the plane's tilt moves by Σ u_k dh_k / Σ u_k² (h: height above
-    the plane), so u/Σu² and v/Σv² are the coefficients. (u, v) are turned so that the numbering runs
-    counter-clockwise.
-    """
-    centred = position - position.mean(axis=1, keepdims=True)
-    left, size, _ = np.linalg.svd(np.where(np.isfinite(centred), centred, 0.0), full_matrices=False)
-    u, v = left[:, :, 0] * size[:, :1], left[:, :, 1] * size[:, 1:2]
-    area = np.sum(u * np.roll(v, -1, axis=1) - v * np.roll(u, -1, axis=1), axis=1)
-    v = v * np.where(area < 0.0, -1.0, 1.0)[:, None]
-    tiny = np.finfo(float).tiny
-    return (
-        u / np.maximum(np.sum(u**2, axis=1, keepdims=True), tiny),
-        v / np.maximum(np.sum(v**2, axis=1, keepdims=True), tiny),
-    )
 
 
 def joint_covariance(

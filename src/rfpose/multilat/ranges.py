@@ -181,7 +181,8 @@ def range_differences(
     difference, fixed, ambiguous = _resolve(
         difference, difference_variance, wavelength, _distances(transmitter)[reference], reference
     )
-    combined, share = _combine(difference, np.where(fixed, 1.0 / variance, 0.0))
+    combined, share, uncommon = _combine(difference, np.where(fixed, 1.0 / variance, 0.0))
+    combined = combined - combined[rows, reference][:, None]
     status = np.full(combined.shape, RangeStatus.OK, np.int8)
     status[~fixed.all(axis=2)] = RangeStatus.TONE_FLOAT
     status[ambiguous] = RangeStatus.AMBIGUOUS
@@ -189,7 +190,7 @@ def range_differences(
     bad = (status == RangeStatus.AMBIGUOUS) | (status == RangeStatus.NOT_RECEIVED)
     result = {
         "range_difference_m": combined,
-        "sigma_m": np.sqrt(np.sum(share**2 * np.where(fixed, own, 0.0) ** 2, axis=2)),
+        "sigma_m": np.sqrt(np.sum(share**2 * np.where(fixed, own, 0.0) ** 2, axis=2) + uncommon),
         "calibration_sigma_m": np.sqrt(np.sum(share**2 * np.where(fixed, common, 0.0) ** 2, axis=2)),
     }
     reference = np.where(missing[:, :, 0].all(axis=1), -1, reference)
@@ -264,25 +265,29 @@ def _resolve(
     return out, fixed, ambiguous
 
 
-def _combine(difference: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _combine(difference: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Combine tones by weight, with one free offset a row and tone (the reference's noise); tone 0 sets the zero.
 
-    Model: difference_iq = x_i + b_q + noise of variance 1/weight_iq, b_0 = 0. Returns x and each tone's share in it.
+    Model: difference_iq = x_i + b_q + noise of variance 1/weight_iq, b_0 = 0. Returns x, each tone's share in it, and
+    what the uncertainty of b adds to the variance of x where a transmitter's shares differ from the row's mean (where
+    they do not, b moves all x alike, which is the clock's affair).
     """
     value = np.where(weight > 0.0, difference, 0.0)
     total = weight.sum(axis=2, keepdims=True)
     share = weight / np.where(total > 0.0, total, 1.0)
-    if value.shape[2] > 1:
-        # normal equations of b after the x_i are eliminated; an unused tone gets b = 0
-        matrix = -np.einsum("rip,riq->rpq", weight, share)
-        diagonal = np.arange(value.shape[2])
-        matrix[:, diagonal, diagonal] += weight.sum(axis=1)
-        right = np.einsum("riq,riq->rq", weight, value - np.sum(share * value, axis=2, keepdims=True))
-        matrix, right = matrix[:, 1:, 1:], right[:, 1:]
-        unit = weight.sum(axis=1)[:, 1:, None]
-        unit = np.where(unit > 0.0, unit, 1.0)
-        matrix = matrix / unit + np.eye(value.shape[2] - 1) * 1e-12
-        offset = np.linalg.solve(matrix, right[:, :, None] / unit)[:, :, 0]
-        value = value.copy()
-        value[:, :, 1:] -= offset[:, None, :]
-    return np.sum(share * value, axis=2), share
+    n_free = value.shape[2] - 1
+    if n_free == 0:
+        return value[:, :, 0], share, np.zeros(value.shape[:2])
+    # normal equations of b after the x_i are eliminated, in units of each tone's weight; an unused tone gets b = 0
+    matrix = -np.einsum("rip,riq->rpq", weight, share)[:, 1:, 1:]
+    of_tone = weight.sum(axis=1)[:, 1:]
+    matrix[:, np.arange(n_free), np.arange(n_free)] += of_tone
+    right = np.einsum("riq,riq->rq", weight, value - np.sum(share * value, axis=2, keepdims=True))[:, 1:]
+    unit = np.sqrt(np.where(of_tone > 0.0, of_tone, 1.0))
+    matrix = matrix / (unit[:, :, None] * unit[:, None, :]) + 1e-12 * np.eye(n_free)
+    inverse = np.linalg.inv(matrix) / (unit[:, :, None] * unit[:, None, :])
+    offset = np.einsum("rpq,rq->rp", inverse, right)
+    value[:, :, 1:] -= offset[:, None, :]
+    mean = np.sum(total * share, axis=1, keepdims=True) / np.maximum(np.sum(total, axis=1, keepdims=True), 1e-300)
+    uncommon = np.where(total > 0.0, share - mean, 0.0)[:, :, 1:]
+    return np.sum(share * value, axis=2), share, np.einsum("rip,rpq,riq->ri", uncommon, inverse, uncommon)
