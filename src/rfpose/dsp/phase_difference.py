@@ -164,13 +164,13 @@ def compensated_dot_phase_difference(
         Different lengths, complex or too short signals, a noise variance that is negative or not finite.
     """
     x1, x2, bad = _pair(s1, s2)
-    variance1 = _numbers("noise_variance1", noise_variance1)
-    variance2 = _numbers("noise_variance2", noise_variance2)
+    variance1 = as_float_array("noise_variance1", noise_variance1, ("...",))
+    variance2 = as_float_array("noise_variance2", noise_variance2, ("...",))
     if np.any(variance1 < 0.0) or np.any(variance2 < 0.0):
         raise InvalidInputError("`noise_variance1` and `noise_variance2` must not be negative")
-    mean1 = _numbers("noise_mean1", noise_mean1)
-    mean2 = _numbers("noise_mean2", noise_mean2)
-    cross = mean1 * mean2 if noise_cross is None else _numbers("noise_cross", noise_cross)
+    mean1 = as_float_array("noise_mean1", noise_mean1, ("...",))
+    mean2 = as_float_array("noise_mean2", noise_mean2, ("...",))
+    cross = mean1 * mean2 if noise_cross is None else as_float_array("noise_cross", noise_cross, ("...",))
     power1 = _mean_product(x1, x1) - variance1 - mean1**2
     power2 = _mean_product(x2, x2) - variance2 - mean2**2
     power = np.where((power1 > 0.0) & (power2 > 0.0), power1 * power2, 0.0)
@@ -308,7 +308,7 @@ def dot_bias_rad(phase_rad: npt.ArrayLike, snr1: npt.ArrayLike, snr2: npt.ArrayL
         A ratio that is not a finite number greater than zero.
     """
     _, g1, g2, _, _ = _noise_arguments(1, snr1, snr2, 1.0, None)
-    cosine = np.cos(_numbers("phase_rad", phase_rad))
+    cosine = np.cos(as_float_array("phase_rad", phase_rad, ("...",)))
     return np.asarray(np.arccos(cosine / np.sqrt((1.0 + 1.0 / g1) * (1.0 + 1.0 / g2))) - np.arccos(cosine))
 
 
@@ -404,7 +404,7 @@ def _dot_sigma(
     a tone has variance ``1/(S B SNR)``, against itself ``2/(S B SNR²)``, against the other's
     ``1/(S max(B1, B2) SNR1 SNR2)``.
     """
-    cosine = np.cos(_numbers("phase_rad", phase_rad))
+    cosine = np.cos(as_float_array("phase_rad", phase_rad, ("...",)))
     k1, k2 = cosine / power1, cosine / power2
     variance = (
         (1.0 - 2.0 * k1 * cosine + k1**2) / (b1 * g1)
@@ -418,11 +418,6 @@ def _dot_sigma(
 
 
 # -- pieces --------------------------------------------------------------------------------------------------
-
-
-def _numbers(name: str, value: npt.ArrayLike, *, positive: bool = False) -> FloatArray:
-    """Check numbers of any shape, a single one included."""
-    return as_float_array(name, value, ["..."], positive=positive).reshape(np.shape(value))
 
 
 def _pair(s1: npt.ArrayLike, s2: npt.ArrayLike) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_]]:
@@ -509,11 +504,11 @@ def _noise_arguments(
     bandwidth1: npt.ArrayLike,
     bandwidth2: npt.ArrayLike | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    n = _numbers("n_sample", n_sample, positive=True)
-    g1 = _numbers("snr1", snr1, positive=True)
-    g2 = g1 if snr2 is None else _numbers("snr2", snr2, positive=True)
-    b1 = _numbers("bandwidth1", bandwidth1, positive=True)
-    b2 = b1 if bandwidth2 is None else _numbers("bandwidth2", bandwidth2, positive=True)
+    n = as_float_array("n_sample", n_sample, ("...",), positive=True)
+    g1 = as_float_array("snr1", snr1, ("...",), positive=True)
+    g2 = g1 if snr2 is None else as_float_array("snr2", snr2, ("...",), positive=True)
+    b1 = as_float_array("bandwidth1", bandwidth1, ("...",), positive=True)
+    b2 = b1 if bandwidth2 is None else as_float_array("bandwidth2", bandwidth2, ("...",), positive=True)
     if np.any(b1 > 1.0) or np.any(b2 > 1.0):
         raise InvalidInputError("`bandwidth1` and `bandwidth2` must not exceed 1 (half the sample rate)")
     return n, g1, g2, b1, b2
