@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
@@ -291,7 +291,8 @@ class _Problem:
 
     def height(self, position_enu_m: FloatArray) -> FloatArray:
         """Height above the transmitters' plane [m]."""
-        return np.asarray((position_enu_m - self.centre[: self.transmitter.shape[1]]) @ self.axes()[-1])
+        up = self.axes()[-1]
+        return np.asarray(position_enu_m @ up - self.centre[: len(up)] @ up)
 
     def mirrored(self, position_enu_m: FloatArray) -> FloatArray:
         """Positions mirrored in the transmitters' plane; a NaN becomes their centroid."""
@@ -311,7 +312,7 @@ class _Problem:
 def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: dict[str, npt.NDArray[Any]]) -> None:
     """Solve unlikely or failed rows again from other starts, and keep the best solution of each."""
     n_axis = problem.transmitter.shape[1]
-    limit = _chi2_limit(result["n_transmitter"] - (n_axis + 1), RESTART_PROBABILITY)
+    limit = _chi2_limit(result["n_transmitter"], n_axis, RESTART_PROBABILITY)
     hopeless = (result["status"] == FixStatus.TOO_FEW) | (result["status"] == FixStatus.NOT_FINITE)
     rows = np.flatnonzero(~hopeless & ~(result["chi2"] <= limit))
     if not rows.size:
@@ -335,7 +336,7 @@ def _take_side(
     row_weight = weight if len(weight) == 1 else weight[rows]
     start = problem.mirrored(result["position_enu_m"][rows])
     again = problem.solve(ranges[rows], row_weight, start, relax=RESTART_RELAX)
-    limit = _chi2_limit(again["n_transmitter"] - 4, SIDE_PROBABILITY)
+    limit = _chi2_limit(again["n_transmitter"], 3, SIDE_PROBABILITY)
     with np.errstate(invalid="ignore"):
         better = (again["status"] == FixStatus.OK) & (sign * problem.height(again["position_enu_m"]) > 0.0)
         better &= (again["chi2"] <= limit) | (again["chi2"] <= result["chi2"][rows])
@@ -343,10 +344,10 @@ def _take_side(
         result[name][rows[better]] = array[better]
 
 
-def _chi2_limit(dof: npt.NDArray[np.signedinteger[Any]], probability: float) -> FloatArray:
-    """Return the value that chi-squared exceeds with ``probability``, for each row's degrees of freedom."""
-    table = np.asarray(chi2_distribution.isf(probability, np.arange(max(int(dof.max(initial=0)), 0) + 1)))
-    return np.asarray(table[np.maximum(dof, 0)], np.float64)
+def _chi2_limit(n_transmitter: IntArray, n_axis: int, probability: float) -> FloatArray:
+    """Return the value that chi-squared exceeds with ``probability``, for each row's number of transmitters."""
+    dof = np.arange(int(n_transmitter.max(initial=0)) + 1) - (n_axis + 1)
+    return np.asarray(np.take(chdtri(np.maximum(dof, 1), probability), n_transmitter), np.float64)
 
 
 def _judge(result: dict[str, npt.NDArray[Any]], n_axis: int, max_dop: float, min_probability: float) -> None:
@@ -357,5 +358,5 @@ def _judge(result: dict[str, npt.NDArray[Any]], n_axis: int, max_dop: float, min
     for name in ("position_enu_m", "clock_m", "cov_enu_m2", "residual_m", "chi2"):
         result[name][weak] = np.nan
     if min_probability > 0.0:
-        limit = _chi2_limit(result["n_transmitter"] - (n_axis + 1), min_probability)
+        limit = _chi2_limit(result["n_transmitter"], n_axis, min_probability)
         status[(status == FixStatus.OK) & (result["chi2"] > limit)] = FixStatus.RESIDUAL
