@@ -109,6 +109,10 @@ def test_convert_there_and_back(directory: Path, tmp_path: Path) -> None:
     there, here = read_result(tmp_path / "r.h5"), read_result(directory / "result.h5")
     np.testing.assert_array_equal(there.poses.normal_enu, here.poses.normal_enu)
     assert there.truth is None
+    shown = _run("evaluate", tmp_path / "r.h5")
+    assert shown.exit_code == 3
+    assert shown.stderr.startswith(f"rfpose: {tmp_path / 'r.h5'}: carries no truth; add --truth")
+    assert _json("evaluate", tmp_path / "r.h5", "--truth", directory / "rec.h5")["solved"] == 3
 
 
 def test_format_names_are_those_of_recording() -> None:

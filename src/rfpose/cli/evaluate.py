@@ -32,10 +32,13 @@ def command(result: Path, truth: Path | None) -> None:
 
     Errors are of the mirror normal; the beam's are twice that.
     """
+    from rfpose.errors import RecordingError
     from rfpose.pipeline.evaluate import evaluate, read_truth
     from rfpose.pipeline.result_file import read_result
 
     found = read_result(result)
+    if truth is None and found.truth is None:
+        raise RecordingError(f"{result}: carries no truth; add --truth FILE (a simulated recording or JSON)")
     evaluation = evaluate(found, None if truth is None else read_truth(truth, found.scenario))
     if wants_json():
         emit_json(evaluation.as_dict())
