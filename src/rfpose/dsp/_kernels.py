@@ -233,11 +233,12 @@ def cosine_sum_response(cycles, n, window, out):
 
 
 @kernel
-def dirichlet_matrix(cycles, n, out):
-    """`dirichlet` of every entry of a matrix."""
-    for a in range(cycles.shape[0]):
-        for b in range(cycles.shape[1]):
-            out[a, b] = dirichlet(cycles[a, b], n)
+def group_response(cycles, template, shift, hop, n_group, out):
+    """Response of line a's sums over ``n_group`` blocks, turned back by its frequency, to each unit line b."""
+    for a in range(cycles.size):
+        for b in range(cycles.size):
+            inside = dirichlet(cycles[b] - shift - template[a], hop)
+            out[a, b] = inside * dirichlet((cycles[b] - cycles[a]) * hop, n_group)
 
 
 @kernel

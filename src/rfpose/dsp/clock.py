@@ -69,9 +69,10 @@ def refine_clock(
         Coherent power at the refined offset, incoherent power, number of blocks.
     """
     every = 1 + 2 * plan.n_tone
-    carrier = streams.stream[::every]
     slope_hop = plan.cycles_per_ppm()[::every] * streams.hop
-    n_block = streams.n_block
+    carrier, n_group = _grouped(streams.stream[::every], float(np.max(np.abs(slope_hop))) * range_ppm)
+    slope_hop = slope_hop * n_group
+    n_block = carrier.shape[1]
     steepest = float(np.max(np.abs(slope_hop)))
     step = 0.25 / (n_block * steepest) if n_block > 1 else np.inf
     reach = min(range_ppm, 0.45 / steepest)
@@ -86,7 +87,7 @@ def refine_clock(
     if n_block > 1:
         small = 0.1 * step
         score = np.empty(3)
-        for _ in range(3):
+        for _ in range(2):
             _kernels.coherent_power(carrier, slope_hop, offset + small * np.arange(-1.0, 2.0), score)
             bend = score[0] - 2.0 * score[1] + score[2]
             if not bend < 0.0:
@@ -97,3 +98,15 @@ def refine_clock(
     _kernels.coherent_power(carrier, slope_hop, np.array([offset]), coherent)
     incoherent = float(np.sum(np.abs(carrier) ** 2)) * n_block
     return clock_ppm + offset, curvature, np.array([coherent[0], incoherent, float(n_block)])
+
+
+def _grouped(stream: npt.NDArray[np.complex128], turns: float) -> tuple[npt.NDArray[np.complex128], int]:
+    """Add up blocks in groups in which the search turns a line by no more than a twentieth of a cycle.
+
+    ``turns`` is how far the search turns a line from block to block. At least sixteen groups are kept; what does not
+    fill a group at the end is left out.
+    """
+    n_line, n_block = stream.shape
+    n_group = max(1, min(int(0.05 / turns) if turns > 0 else n_block, n_block // 16))
+    n_part = n_block // n_group
+    return np.ascontiguousarray(stream[:, : n_part * n_group].reshape(n_line, n_part, n_group).sum(axis=2)), n_group

@@ -118,11 +118,38 @@ class ToneExtractor:
                 streams = bank.streams(x, start_ppm)
                 ppm, curvature, power = refine_clock(streams, self.plan, start_ppm, drift)
         streams = streams.at_clock(self.plan, start_ppm, ppm)
-        if self.estimator == "correlator":
+        if self.estimator != "correlator":
+            return self._from_filters(streams, ppm, curvature, clipped)
+        slope = self.plan.cycles_per_ppm()
+        fit = fit_lines(streams, slope)
+        if abs(fit.clock_step_ppm) > 0.3 * fit.clock_step_sigma_ppm:
             # the power's maximum is shifted a little by leakage between lines; their joint fit is not
-            step = fit_lines(streams, self.plan.cycles_per_ppm()).clock_step_ppm
-            streams, ppm = streams.at_clock(self.plan, ppm, ppm + step), ppm + step
-        return self._tones(streams, ppm, curvature, clipped)
+            ppm += fit.clock_step_ppm
+            fit = fit_lines(streams.at_clock(self.plan, ppm - fit.clock_step_ppm, ppm), slope)
+        tone = hilbert.analytic_tones(fit.amplitude[:, None], self.plan.n_transmitter, self.plan.n_tone)[..., 0]
+        return self._tones(
+            fit.amplitude,
+            fit.variance,
+            tone,
+            np.angle(tone),
+            0.0,
+            float(len(x)),
+            (ppm, fit.clock_step_sigma_ppm),
+            clipped,
+        )
+
+    def _from_filters(self, streams: LineStreams, ppm: float, curvature: float, clipped: float) -> FrameTones:
+        """Measure by averaging the filtered, analytic tones."""
+        n_transmitter, n_tone = self.plan.n_transmitter, self.plan.n_tone
+        line = hilbert.centred_streams(streams)
+        amplitude, variance = hilbert.average_lines(streams, line)
+        tone = hilbert.analytic_tones(amplitude[:, None], n_transmitter, n_tone)[..., 0]
+        phase, added = self._averaged_phase(
+            streams, hilbert.analytic_tones(line, n_transmitter, n_tone), tone, variance
+        )
+        n_effective = hilbert.window_statistics(streams).equivalent_samples
+        clock = ppm, _clock_sigma(streams, curvature, float(np.median(variance)) * n_effective)
+        return self._tones(amplitude, variance, tone, phase, added, n_effective, clock, clipped)
 
     def _fault(self, x: Samples) -> tuple[LineStatus, float]:
         """Return what is wrong with the samples, and the fraction at full scale."""
@@ -145,43 +172,39 @@ class ToneExtractor:
             return LineStatus.CLIPPED, clipped
         return LineStatus.OK, clipped
 
-    def _tones(self, streams: LineStreams, ppm: float, curvature: float, clipped: float) -> FrameTones:
-        n_transmitter, n_tone = self.plan.n_transmitter, self.plan.n_tone
-        if self.estimator == "correlator":
-            fit = fit_lines(streams, self.plan.cycles_per_ppm())
-            amplitude, variance = fit.amplitude, fit.variance
-            tone = hilbert.analytic_tones(amplitude[:, None], n_transmitter, n_tone)[..., 0]
-            phase = np.angle(tone)
-            unit_loss = np.zeros_like(phase)
-        else:
-            line = hilbert.centred_streams(streams)
-            amplitude, variance = hilbert.average_lines(streams, line)
-            tones = hilbert.analytic_tones(line, n_transmitter, n_tone)
-            tone = hilbert.analytic_tones(amplitude[:, None], n_transmitter, n_tone)[..., 0]
-            phase, unit_loss = self._averaged_phase(streams, tones, tone, variance)
-        lines = variance.reshape(n_transmitter, 1 + 2 * n_tone)
+    def _tones(
+        self,
+        amplitude: ComplexArray,
+        variance: FloatArray,
+        tone: ComplexArray,
+        phase: FloatArray,
+        added_variance: FloatArray | float,
+        n_effective: float,
+        clock: tuple[float, float],
+        clipped: float,
+    ) -> FrameTones:
+        """Put the record together, and mark what is too weak."""
+        n_transmitter = self.plan.n_transmitter
+        by_transmitter, lines = amplitude.reshape(n_transmitter, -1), variance.reshape(n_transmitter, -1)
         tone_variance = lines[:, 1::2] + lines[:, 2::2]
         tone_power = np.abs(tone) ** 2
-        sigma = np.sqrt(0.5 * tone_variance / tone_power + unit_loss)
-        carrier = amplitude.reshape(n_transmitter, -1)[:, 0]
+        sigma = np.sqrt(0.5 * tone_variance / tone_power + added_variance)
         status = np.full(n_transmitter, LineStatus.OK, np.uint8)
-        weak = np.any(tone_power < _TONE_POWER_SNR * tone_variance, axis=1)
-        status[weak] = LineStatus.WEAK
-        status[np.abs(carrier) ** 2 < _CARRIER_POWER_SNR * lines[:, 0]] = LineStatus.ABSENT
+        status[np.any(tone_power < _TONE_POWER_SNR * tone_variance, axis=1)] = LineStatus.WEAK
+        status[np.abs(by_transmitter[:, 0]) ** 2 < _CARRIER_POWER_SNR * lines[:, 0]] = LineStatus.ABSENT
         bad = status != LineStatus.OK
         phase[bad] = np.nan
         sigma[bad] = np.nan
-        per_sample = float(np.median(variance)) * _effective_samples(streams)
         return FrameTones(
             phase_rad=phase,
             sigma_rad=sigma,
-            carrier=carrier,
+            carrier=by_transmitter[:, 0],
             carrier_sigma=np.sqrt(0.5 * lines[:, 0]),
-            sideband=np.stack([amplitude.reshape(n_transmitter, -1)[:, k::2] for k in (1, 2)], axis=-1),
+            sideband=np.stack([by_transmitter[:, k::2] for k in (1, 2)], axis=-1),
             sideband_sigma=np.sqrt(0.5 * np.stack([lines[:, k::2] for k in (1, 2)], axis=-1)),
-            clock_ppm=ppm,
-            clock_sigma_ppm=_clock_sigma(streams, curvature, per_sample),
-            noise_variance=per_sample,
+            clock_ppm=clock[0],
+            clock_sigma_ppm=clock[1],
+            noise_variance=float(np.median(variance)) * n_effective,
             clipped_fraction=clipped,
             status=status,
         )
@@ -207,14 +230,6 @@ class ToneExtractor:
         return phase, np.zeros_like(phase)
 
 
-def _effective_samples(streams: LineStreams) -> float:
-    return (
-        float(streams.n_sample)
-        if streams.hop == streams.n_tap
-        else hilbert.window_statistics(streams).equivalent_samples
-    )
-
-
 def _clock_sigma(streams: LineStreams, curvature: float, noise_variance: float) -> float:
     """Return the standard deviation of the clock offset [ppm] from the curvature of the coherent power."""
     if not curvature > 0.0:
@@ -222,7 +237,7 @@ def _clock_sigma(streams: LineStreams, curvature: float, noise_variance: float) 
     response = streams.response()
     gain = float(np.mean(np.abs(response)))
     covered = gain * streams.n_block
-    n = _effective_samples(streams)
+    n = hilbert.window_statistics(streams).equivalent_samples
     return float(np.sqrt(noise_variance * covered**2 / (2.0 * curvature * n)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,6 +20,9 @@ def n_worker() -> int:
     return os.cpu_count() or 1
 
 
+_SWITCH_INTERVAL_S = 1e-4
+
+
 @contextmanager
 def worker_pool() -> Iterator[ThreadPoolExecutor]:
     """Yield a pool with one thread a core, while BLAS keeps to the thread that calls it.
@@ -26,8 +30,14 @@ def worker_pool() -> Iterator[ThreadPoolExecutor]:
     A frame's matrix products are too small to share; BLAS threads that wait for each other would only take the
     cores from the other receivers.
     """
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(n_worker(), "rfpose") as pool:
-        try:
-            yield pool
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    # a thread that comes out of a kernel should not wait Python's usual 5 ms for the interpreter
+    switch_interval = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    try:
+        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(n_worker(), "rfpose") as pool:
+            try:
+                yield pool
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+    finally:
+        sys.setswitchinterval(switch_interval)

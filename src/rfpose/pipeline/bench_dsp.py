@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -81,13 +82,15 @@ def _estimator(
     bandwidth: float,
 ) -> dict[str, float]:
     clock_ppm = extractor.acquire_clock(frames[0])
-    buffers = [np.empty_like(frames[0]) for _ in range(len(frames))]
+    own = threading.local()
 
     def from_memory(i: int) -> Any:
         return extractor.measure(frames[i], clock_ppm=clock_ppm)
 
     def from_file(i: int) -> Any:
-        samples = recording.read(recording.receiver_ids[i], 0, N_SAMPLE, out=buffers[i])
+        if not hasattr(own, "buffer"):
+            own.buffer = np.empty_like(frames[0])
+        samples = recording.read(recording.receiver_ids[i], 0, N_SAMPLE, out=own.buffer)
         return extractor.measure(samples, clock_ppm=clock_ppm)
 
     count = len(frames) * N_SAMPLE
