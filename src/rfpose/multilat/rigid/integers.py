@@ -1,0 +1,258 @@
+"""From wrapped phases to poses: coarse tone first, each finer wavelength once its integers are safe.
+
+The pose found so far predicts the next finer range with a known uncertainty. Its integers are rounded where that makes
+a wrong one rarer than the stated risk; otherwise the mirror keeps the coarser solution and says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import erfc
+
+from rfpose.checks import FloatArray, as_float_array
+from rfpose.errors import InvalidInputError
+from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, solve_rigid
+
+__all__ = ["Observation", "RigidSolution", "align_points", "solve_ladder"]
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """One wavelength's phases as ranges: a tone, or the carrier.
+
+    Attributes
+    ----------
+    range_m : (mirror, receiver, transmitter)
+        −λ/(2π) × phase, up to whole wavelengths [m]; NaN = not received.
+    sigma_m : (mirror, receiver, transmitter)
+        Own noise [m].
+    transmitter_sigma_m : (mirror, transmitter)
+        Error common to all receivers [m]; infinity where nothing calibrates it.
+    wavelength_m : (transmitter,)
+        [m].
+    clock_class
+        0 for tones, 1 for the carrier.
+    """
+
+    range_m: FloatArray
+    sigma_m: FloatArray
+    transmitter_sigma_m: FloatArray
+    wavelength_m: FloatArray
+    clock_class: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigidSolution:
+    """Poses, and which wavelengths they rest on.
+
+    Attributes
+    ----------
+    poses
+        The finest solution of each mirror.
+    fixed : (mirror, observation)
+        Whether an observation's integers were resolved and used.
+    wrong_risk : (mirror, observation)
+        Probability, beforehand, that any of its integers is wrong; 1 where it could not be judged.
+    """
+
+    poses: RigidPoses
+    fixed: BoolArray
+    wrong_risk: FloatArray
+
+
+def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Rotation and origin that put mirror coordinates onto measured points best (Kabsch 1976).
+
+    Parameters
+    ----------
+    receiver_mirror_m : (mirror, receiver, xyz)
+        [m].
+    receiver_enu_m : (mirror, receiver, xyz)
+        [m]; a mirror with a NaN gives NaN.
+
+    Returns
+    -------
+    origin_enu_m : (mirror, xyz)
+    rot_enu_from_mirror : (mirror, 3, 3)
+    """
+    mirror = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
+    enu = as_float_array("receiver_enu_m", receiver_enu_m, mirror.shape, finite=False)
+    good: BoolArray = np.asarray(np.isfinite(enu).all(axis=(1, 2)))
+    points = np.where(good[:, None, None], enu, mirror)
+    mean_mirror, mean_enu = mirror.mean(axis=1, keepdims=True), points.mean(axis=1, keepdims=True)
+    cross = np.swapaxes(points - mean_enu, 1, 2) @ (mirror - mean_mirror)
+    u, _, vt = np.linalg.svd(cross)
+    flip = np.ones((len(mirror), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+    rot = (u * flip[:, None, :]) @ vt
+    origin = mean_enu[:, 0] - np.einsum("mab,mb->ma", rot, mean_mirror[:, 0])
+    rot[~good] = np.nan
+    origin[~good] = np.nan
+    return origin, rot
+
+
+def solve_ladder(
+    transmitter_enu_m: npt.ArrayLike,
+    receiver_mirror_m: npt.ArrayLike,
+    observations: list[Observation],
+    *,
+    start_pivot_enu_m: npt.ArrayLike,
+    start_rot_enu_from_mirror: npt.ArrayLike,
+    start_sigma_m: npt.ArrayLike | None = None,
+    knowledge: Knowledge | None = None,
+    wrong_risk: float = 1e-6,
+) -> RigidSolution:
+    """Solve poses from the coarsest wavelength down.
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    receiver_mirror_m : (mirror, receiver, xyz)
+        From the pivot, in the mirror frame [m].
+    observations
+        Coarsest first; the first one's integers must be resolved already unless ``start_sigma_m`` is given.
+    start_pivot_enu_m, start_rot_enu_from_mirror : (mirror, xyz), (mirror, 3, 3)
+        Where to begin.
+    start_sigma_m : (mirror,), optional
+        Uncertainty of the start's receiver positions [m], when even the first observation must be resolved from it.
+    knowledge
+        Clocks, pivot, mount.
+    wrong_risk
+        Largest probability that any integer of an observation is wrong, for it to be used.
+
+    Raises
+    ------
+    InvalidInputError
+        No observation, or shapes that do not fit.
+    """
+    if not observations:
+        raise InvalidInputError("`observations` must hold at least one wavelength")
+    if not 0.0 < wrong_risk < 1.0:
+        raise InvalidInputError(f"`wrong_risk` must lie between 0 and 1, got {wrong_risk}")
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
+    n_mirror = len(places)
+    fixed = np.zeros((n_mirror, len(observations)), np.bool_)
+    risk = np.ones((n_mirror, len(observations)))
+    resolved = [np.full(o.range_m.shape, np.nan) for o in observations]
+    poses: RigidPoses | None = None
+    for k, observation in enumerate(observations):
+        if poses is None and start_sigma_m is None:
+            resolved[k] = observation.range_m
+            fixed[:, k], risk[:, k] = True, 0.0
+        else:
+            ranges, risk[:, k] = _resolve(
+                observation,
+                transmitter,
+                places,
+                poses,
+                np.asarray(start_pivot_enu_m, np.float64),
+                np.asarray(start_rot_enu_from_mirror, np.float64),
+                None if start_sigma_m is None else np.broadcast_to(start_sigma_m, (n_mirror,)),
+                knowledge or Knowledge(),
+            )
+            safe: BoolArray = np.less_equal(risk[:, k], wrong_risk)
+            fixed[:, k] = safe
+            resolved[k] = np.where(safe[:, None, None], ranges, np.nan)
+        used = observations[: k + 1]
+        solution = solve_rigid(
+            transmitter,
+            places,
+            np.stack(resolved[: k + 1], axis=1),
+            sigma_m=np.stack([o.sigma_m for o in used], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in used], axis=1),
+            clock_class=[o.clock_class for o in used],
+            start_pivot_enu_m=start_pivot_enu_m if poses is None else _or(poses.pivot_enu_m, start_pivot_enu_m),
+            start_rot_enu_from_mirror=start_rot_enu_from_mirror
+            if poses is None
+            else _or(poses.rot_enu_from_mirror, start_rot_enu_from_mirror),
+            knowledge=knowledge,
+        )
+        poses = solution
+    assert poses is not None
+    return RigidSolution(poses=poses, fixed=fixed, wrong_risk=risk)
+
+
+def _or(first: FloatArray, second: npt.ArrayLike) -> FloatArray:
+    return np.where(np.isfinite(first), first, np.asarray(second, np.float64))
+
+
+def _resolve(
+    observation: Observation,
+    transmitter: FloatArray,
+    places: FloatArray,
+    poses: RigidPoses | None,
+    start_pivot: FloatArray,
+    start_rot: FloatArray,
+    start_sigma: FloatArray | None,
+    known: Knowledge,
+) -> tuple[FloatArray, FloatArray]:
+    """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
+    usable = poses is not None and np.any(poses.status == RigidStatus.OK)
+    pivot = start_pivot if poses is None else poses.pivot_enu_m
+    rot = start_rot if poses is None else poses.rot_enu_from_mirror
+    arm = np.einsum("mab,mrb->mra", rot, places)
+    to_receiver = (pivot[:, None] + arm)[:, :, None] - transmitter
+    distance = np.linalg.norm(to_receiver, axis=-1)
+    direction = to_receiver / distance[..., None]
+    slope = np.concatenate([direction, np.cross(arm[:, :, None], direction)], axis=-1)
+    wavelength = observation.wavelength_m
+    left = observation.range_m - distance
+    calibrated = np.isfinite(observation.transmitter_sigma_m).all()
+    if calibrated:
+        # each range against the pose; the clock is the mean over transmitters, found on the circle
+        left = left - _circular_mean(left, wavelength, axis=2)
+        slope = slope - slope.mean(axis=2, keepdims=True)
+        noise = observation.sigma_m**2 + observation.transmitter_sigma_m[:, None] ** 2
+    else:
+        # only differences between receivers mean anything
+        left = left - left[:, :1]
+        slope = slope - slope[:, :1]
+        noise = observation.sigma_m**2 + observation.sigma_m[:, :1] ** 2
+        if not np.isfinite(known.clock_sigma_m):
+            left = left - _circular_mean(left, wavelength, axis=2)
+            slope = slope - slope.mean(axis=2, keepdims=True)
+        else:
+            noise = noise + 2.0 * known.clock_sigma_m**2
+    if usable:
+        assert poses is not None
+        predicted = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
+    else:
+        assert start_sigma is not None
+        predicted = np.broadcast_to((start_sigma**2)[:, None, None], left.shape)
+    sigma = np.sqrt(predicted + noise)
+    turns = np.rint(left / wavelength)
+    with np.errstate(invalid="ignore"):
+        wrong = erfc(0.5 * wavelength / (np.sqrt(2.0) * sigma))
+    risk = np.nansum(np.where(np.isfinite(left), wrong, 0.0), axis=(1, 2))
+    risk = np.where(np.isfinite(left).any(axis=(1, 2)), np.minimum(risk, 1.0), 1.0)
+    return observation.range_m - turns * wavelength, risk
+
+
+def _circular_mean(left: FloatArray, wavelength: FloatArray, axis: int) -> FloatArray:
+    """Return the common offset of ranges known up to whole wavelengths, as a range near zero; per receiver.
+
+    With unequal wavelengths (carriers) the offset is the one that fits all best on the grid of the longest.
+    """
+    weight = np.isfinite(left)
+    if np.ptp(wavelength) == 0.0:
+        phasor = np.where(weight, np.exp(2j * np.pi * np.nan_to_num(left) / wavelength), 0.0)
+        mean = np.angle(phasor.sum(axis=axis, keepdims=True)) / (2 * np.pi) * wavelength[0]
+        return np.asarray(mean)
+    reach = float(np.max(wavelength))
+    best = np.zeros(left.sum(axis=axis, keepdims=True).shape)
+    best_score = np.full(best.shape, -np.inf)
+    for offset in np.linspace(-0.5, 0.5, 33)[:-1] * reach:
+        turn = np.where(weight, np.cos(2 * np.pi * (np.nan_to_num(left) - offset) / wavelength), 0.0)
+        score = turn.sum(axis=axis, keepdims=True)
+        better = score > best_score
+        best, best_score = np.where(better, offset, best), np.where(better, score, best_score)
+    fine = left - best
+    fine = fine - np.rint(fine / wavelength) * wavelength
+    return np.asarray(best + np.nanmean(fine, axis=axis, keepdims=True))
