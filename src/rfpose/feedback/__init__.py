@@ -1,0 +1,1 @@
+"""Sun, mount and calibration of heliostats: what steers a mirror, and how far that is wrong."""

@@ -1,0 +1,452 @@
+"""Kernels of the mount and of its calibration.
+
+One heliostat is two rows of numbers. ``p`` (N_PARAMETER) is what a calibration may change, in the order of
+``rfpose.feedback.mount.PARAMETERS``; ``k`` (N_CONSTANT) is what it may not:
+
+    0:9    rotation of the nominal mount frame into ENU, by rows      9, 10   actuator kind: 0 rotary, 1 linear
+    11, 12 sign of the axis angle   13, 14 counts per rad or per m    15, 16  axis angle at count zero [rad]
+    17, 18 worm gear ratio          19:22  nominal pivot ENU [m]      22:26   lowest, highest count of axis 1, axis 2
+
+A measurement is a row ``m`` (N_ROW): source xyz, 1 if the source is a point, target xyz, 1 if the target is a
+point, sigma of the normal [rad], 1 if the row is the receiver plane's normal and not the mirror's.
+"""
+
+import math
+
+import numba as nb
+import numpy as np
+
+from rfpose.jit import kernel, kernel_parallel
+
+N_PARAMETER = 31
+N_CONSTANT = 26
+N_ROW = 10
+_N_PREPARED = 16
+# Median of a Rayleigh variable in units of its sigma: the residual has two components.
+_RAYLEIGH_MEDIAN = 1.1774100225154747
+_STEP = 1e-6
+
+
+@kernel
+def _opening(length, radius, offset):
+    """Angle between the two sides of a linear actuator's triangle; NaN where it does not close."""
+    cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
+    if cosine < -1.0 or cosine > 1.0:
+        return np.nan
+    return math.acos(cosine)
+
+
+@kernel
+def _prepare(p, k, out):
+    """What does not depend on the posture: rotation (9), pivot (3), opening angles at count zero (2)."""
+    cn, sn = math.cos(p[0]), math.sin(p[0])
+    ce, se = math.cos(p[1]), math.sin(p[1])
+    ct, st = math.cos(p[2]), math.sin(p[2])
+    for j in range(3):
+        x, y, z = k[j], k[3 + j], k[6 + j]
+        x, y = ct * x + st * y, ct * y - st * x  # twist, clockwise from above
+        y, z = cn * y + sn * z, cn * z - sn * y  # tilt towards north
+        x, z = ce * x + se * z, ce * z - se * x  # tilt towards east
+        out[j], out[3 + j], out[6 + j] = x, y, z
+    length = p[11]
+    out[9] = k[19] + p[8] + length * se * cn
+    out[10] = k[20] + p[9] + length * sn
+    out[11] = k[21] + p[10] + length * (ce * cn - 1.0)
+    for a in range(2):
+        out[12 + a] = _opening(p[18 + a], p[20 + a], p[22 + a]) if k[9 + a] > 0.5 else 0.0
+
+
+@kernel
+def _axis(a, count, p, k, prepared):
+    """Angle of axis ``a`` at a motor position."""
+    travel = count / k[13 + a] * (1.0 + p[16 + a])
+    if k[9 + a] > 0.5:
+        travel = _opening(p[18 + a] + travel, p[20 + a], p[22 + a]) - prepared[12 + a]
+    angle = k[15 + a] + k[11 + a] * travel + p[3 + a]
+    turn = k[17 + a] * angle
+    s, c = p[24 + 2 * a], p[25 + 2 * a]
+    if s != 0.0 or c != 0.0:
+        angle += s * math.sin(turn) + c * math.cos(turn)
+    return angle
+
+
+@kernel
+def _posture(azimuth, elevation, p, prepared, receiver, out):
+    """Mirror normal (3) and centre (3) in ENU at two axis angles."""
+    sa, ca = math.sin(azimuth), math.cos(azimuth)
+    se, ce = math.sin(elevation), math.cos(elevation)
+    sd, cd = math.sin(p[5]), math.cos(p[5])
+    # canting in the mirror frame: towards right, towards up
+    across = p[7] + receiver * p[30]
+    along = p[6] + receiver * p[29]
+    inverse = 1.0 / math.sqrt(1.0 + across * across + along * along)
+    for which in range(2):
+        if which == 0:
+            r, up, n, ahead = across * inverse, along * inverse, inverse, 0.0
+        else:
+            r, up, n, ahead = p[14], p[13], p[12], p[15]
+        # frame of axis 1: right, forward, up; then axis 2's non-orthogonality, about forward
+        f = ce * n - se * up
+        u = se * n + ce * up
+        r, u = cd * r + sd * u, cd * u - sd * r
+        f += ahead
+        x = sa * f - ca * r
+        y = ca * f + sa * r
+        for i in range(3):
+            value = prepared[3 * i] * x + prepared[3 * i + 1] * y + prepared[3 * i + 2] * u
+            out[3 * which + i] = value + (prepared[9 + i] if which == 1 else 0.0)
+    sag = p[28]
+    if sag != 0.0:
+        z = out[2]
+        x, y, z = out[0] * (1.0 + sag * z), out[1] * (1.0 + sag * z), z * (1.0 + sag * z) - sag
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+        out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
+
+
+@kernel
+def _bisector(m, centre, out):
+    """Normal that sends the row's source to its target from a mirror centre."""
+    length_s = 0.0
+    length_t = 0.0
+    s0, s1, s2 = m[0] - m[3] * centre[0], m[1] - m[3] * centre[1], m[2] - m[3] * centre[2]
+    t0, t1, t2 = m[4] - m[7] * centre[0], m[5] - m[7] * centre[1], m[6] - m[7] * centre[2]
+    length_s = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+    length_t = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    x = s0 / length_s + t0 / length_t
+    y = s1 / length_s + t1 / length_t
+    z = s2 / length_s + t2 / length_t
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
+
+
+@kernel
+def _residuals(p, k, count, row, use, out):
+    """Modelled minus measured normal over sigma, (measurement, xyz); zero where not used."""
+    prepared = np.empty(_N_PREPARED)
+    state = np.empty(6)
+    wanted = np.empty(3)
+    _prepare(p, k, prepared)
+    for i in range(len(row)):
+        if not use[i]:
+            out[i, 0] = out[i, 1] = out[i, 2] = 0.0
+            continue
+        azimuth = _axis(0, count[i, 0], p, k, prepared)
+        elevation = _axis(1, count[i, 1], p, k, prepared)
+        _posture(azimuth, elevation, p, prepared, row[i, 9], state)
+        _bisector(row[i], state[3:], wanted)
+        for j in range(3):
+            out[i, j] = (state[j] - wanted[j]) / row[i, 8]
+
+
+@kernel_parallel
+def residuals_batch(p, k, count, row, use):
+    """Residuals of many heliostats (heliostat, measurement, xyz), in sigma."""
+    out = np.empty((len(p), row.shape[1], 3))
+    for h in nb.prange(len(p)):
+        _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
+    return out
+
+
+@kernel_parallel
+def jacobian_batch(p, k, count, row, use, free, scale):
+    """Central differences of the residuals by free parameters, (heliostat, measurement, xyz, parameter)."""
+    out = np.empty((len(p), row.shape[1], 3, len(free)))
+    for h in nb.prange(len(p)):
+        trial = p[h].copy()
+        high = np.empty((row.shape[1], 3))
+        low = np.empty((row.shape[1], 3))
+        for f in range(len(free)):
+            step = 10.0 * _STEP * scale[f]
+            trial[free[f]] = p[h, free[f]] + step
+            _residuals(trial, k[h], count[h], row[h], use[h], high)
+            trial[free[f]] = p[h, free[f]] - step
+            _residuals(trial, k[h], count[h], row[h], use[h], low)
+            trial[free[f]] = p[h, free[f]]
+            for i in range(row.shape[1]):
+                for j in range(3):
+                    out[h, i, j, f] = (high[i, j] - low[i, j]) / (2.0 * step)
+    return out
+
+
+@kernel_parallel
+def posture_batch(p, k, count, receiver):
+    """Axis angles, normal and centre (heliostat, posture, 8)."""
+    out = np.empty((len(p), count.shape[1], 8))
+    for h in nb.prange(len(p)):
+        prepared = np.empty(_N_PREPARED)
+        _prepare(p[h], k[h], prepared)
+        for i in range(count.shape[1]):
+            out[h, i, 0] = _axis(0, count[h, i, 0], p[h], k[h], prepared)
+            out[h, i, 1] = _axis(1, count[h, i, 1], p[h], k[h], prepared)
+            _posture(out[h, i, 0], out[h, i, 1], p[h], prepared, receiver, out[h, i, 2:])
+    return out
+
+
+@kernel
+def _count_guess(a, angle, p, k, prepared):
+    """Motor position for an axis angle, worm gear left out; NaN where the actuator cannot reach it."""
+    travel = (angle - k[15 + a] - p[3 + a]) * k[11 + a]
+    if k[9 + a] > 0.5:
+        opening = travel + prepared[12 + a]
+        if opening < 0.0 or opening > math.pi:
+            return np.nan
+        radius, offset = p[20 + a], p[22 + a]
+        square = offset * offset + radius * radius - 2.0 * offset * radius * math.cos(opening)
+        travel = math.sqrt(max(square, 0.0)) - p[18 + a]
+    return travel / (1.0 + p[16 + a]) * k[13 + a]
+
+
+@kernel
+def _command_one(p, k, prepared, m, out, state, moved, wanted):
+    """Axis angles, then counts, that make the mirror send the row's source to its target; returns 0 if done."""
+    for i in range(3):
+        state[3 + i] = prepared[9 + i]
+    _bisector(m, state[3:], wanted)
+    # back into the nominal mount frame for a first guess
+    x = prepared[0] * wanted[0] + prepared[3] * wanted[1] + prepared[6] * wanted[2]
+    y = prepared[1] * wanted[0] + prepared[4] * wanted[1] + prepared[7] * wanted[2]
+    z = prepared[2] * wanted[0] + prepared[5] * wanted[1] + prepared[8] * wanted[2]
+    azimuth = math.atan2(x, y)
+    elevation = math.atan2(z, math.hypot(x, y))
+    done = False
+    for _ in range(30):
+        _posture(azimuth, elevation, p, prepared, 0.0, state)
+        _bisector(m, state[3:], wanted)
+        e0, e1, e2 = wanted[0] - state[0], wanted[1] - state[1], wanted[2] - state[2]
+        if not (e0 * e0 + e1 * e1 + e2 * e2 < 10.0):
+            return 1
+        if e0 * e0 + e1 * e1 + e2 * e2 < 1e-26:
+            done = True
+            break
+        h = 1e-6
+        _posture(azimuth + h, elevation, p, prepared, 0.0, moved)
+        a0, a1, a2 = (moved[0] - state[0]) / h, (moved[1] - state[1]) / h, (moved[2] - state[2]) / h
+        _posture(azimuth, elevation + h, p, prepared, 0.0, moved)
+        b0, b1, b2 = (moved[0] - state[0]) / h, (moved[1] - state[1]) / h, (moved[2] - state[2]) / h
+        aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
+        ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
+        determinant = aa * bb - ab * ab
+        if determinant < 1e-14:
+            return 1
+        azimuth += (bb * ae - ab * be) / determinant
+        elevation += (aa * be - ab * ae) / determinant
+    if not done:
+        return 1
+    # an azimuth axis may have to be taken a whole turn further to lie within its counts
+    for a in range(2):
+        angle = azimuth if a == 0 else elevation
+        best = np.nan
+        for turn in range(-1, 2):
+            goal = angle + 2.0 * math.pi * turn
+            worm = 0.0
+            for _ in range(8):
+                worm = p[24 + 2 * a] * math.sin(k[17 + a] * (goal - worm)) + p[25 + 2 * a] * math.cos(
+                    k[17 + a] * (goal - worm)
+                )
+            count = _count_guess(a, goal - worm, p, k, prepared)
+            if k[22 + 2 * a] <= count <= k[23 + 2 * a]:
+                best = count
+                break
+            if turn == 0:
+                best = count
+        out[a] = best
+    for a in range(2):
+        if not (k[22 + 2 * a] <= out[a] <= k[23 + 2 * a]):
+            return 2
+    return 0
+
+
+@kernel_parallel
+def command_batch(p, k, row):
+    """Counts (heliostat, posture, 2) for rows of source and target, and a status: 0 done, 1 no solution, 2 limits."""
+    n = row.shape[1]
+    out = np.full((len(p), n, 2), np.nan)
+    status = np.empty((len(p), n), np.int8)
+    for h in nb.prange(len(p)):
+        prepared = np.empty(_N_PREPARED)
+        state = np.empty(6)
+        moved = np.empty(6)
+        wanted = np.empty(3)
+        _prepare(p[h], k[h], prepared)
+        for i in range(n):
+            status[h, i] = _command_one(p[h], k[h], prepared, row[h, i], out[h, i], state, moved, wanted)
+    return out, status
+
+
+@kernel
+def _median_norm(r, use, norm):
+    """Norm of each residual into ``norm``; returns the median over those in use."""
+    n = 0
+    kept = np.empty(len(r))
+    for i in range(len(r)):
+        norm[i] = math.sqrt(r[i, 0] ** 2 + r[i, 1] ** 2 + r[i, 2] ** 2)
+        if use[i]:
+            kept[n] = norm[i]
+            n += 1
+    return np.median(kept[:n]) if n else np.nan
+
+
+@kernel
+def _loss(norm, use, cut):
+    """Huber's loss of the residual norms, in their own unit."""
+    total = 0.0
+    for i in range(len(norm)):
+        if use[i]:
+            e = norm[i]
+            total += 0.5 * e * e if e <= cut else cut * (e - 0.5 * cut)
+    return total
+
+
+@kernel
+def _prior_loss(p, free, prior_mean, prior_weight):
+    total = 0.0
+    for f in range(len(free)):
+        total += 0.5 * prior_weight[f] * (p[free[f]] - prior_mean[f]) ** 2
+    return total
+
+
+@kernel
+def _cholesky_solve(a, b):
+    """Solve ``a x = b`` in place of ``b``; returns False if ``a`` is not positive definite."""
+    n = len(b)
+    for j in range(n):
+        for i in range(j, n):
+            s = a[i, j]
+            for q in range(j):
+                s -= a[i, q] * a[j, q]
+            if i == j:
+                if not s > 0.0:
+                    return False
+                a[j, j] = math.sqrt(s)
+            else:
+                a[i, j] = s / a[j, j]
+    for i in range(n):
+        s = b[i]
+        for q in range(i):
+            s -= a[i, q] * b[q]
+        b[i] = s / a[i, i]
+    for i in range(n - 1, -1, -1):
+        s = b[i]
+        for q in range(i + 1, n):
+            s -= a[q, i] * b[q]
+        b[i] = s / a[i, i]
+    return True
+
+
+@kernel
+def _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, gradient):
+    """Weighted normal matrix and gradient in scaled parameters, Jacobian by forward differences."""
+    n_free = len(free)
+    m = len(row)
+    jacobian = np.empty((n_free, m, 3))
+    trial = p.copy()
+    for f in range(n_free):
+        step = _STEP * scale[f]
+        trial[free[f]] = p[free[f]] + step
+        _residuals(trial, k, count, row, use, jacobian[f])
+        trial[free[f]] = p[free[f]]
+        for i in range(m):
+            weight = 1.0 if norm[i] <= cut else math.sqrt(cut / norm[i])
+            for j in range(3):
+                jacobian[f, i, j] = (jacobian[f, i, j] - r[i, j]) / _STEP * weight
+    for f in range(n_free):
+        total = 0.0
+        for i in range(m):
+            weight = 1.0 if norm[i] <= cut else math.sqrt(cut / norm[i])
+            for j in range(3):
+                total += jacobian[f, i, j] * r[i, j] * weight
+        gradient[f] = total
+        for g in range(f + 1):
+            total = 0.0
+            for i in range(m):
+                for j in range(3):
+                    total += jacobian[f, i, j] * jacobian[g, i, j]
+            normal[f, g] = total
+            normal[g, f] = total
+
+
+@kernel
+def _fit_one(p, k, count, row, use, free, scale, low, high, prior_mean, prior_weight, huber, sigma_known, max_iteration):
+    """Levenberg-Marquardt with Huber's loss, in place; returns iterations (negative: did not settle) and scale."""
+    n_free = len(free)
+    m = len(row)
+    r = np.empty((m, 3))
+    r_new = np.empty((m, 3))
+    norm = np.empty(m)
+    norm_new = np.empty(m)
+    normal = np.empty((n_free, n_free))
+    damped = np.empty((n_free, n_free))
+    gradient = np.empty(n_free)
+    step = np.empty(n_free)
+    trial = p.copy()
+    weight = np.empty(n_free)
+    damping = 1e-3
+    _residuals(p, k, count, row, use, r)
+    noise = 1.0
+    for iteration in range(max_iteration):
+        middle = _median_norm(r, use, norm)
+        if not middle < np.inf:
+            return -1, np.nan
+        if not sigma_known:
+            noise = max(middle / _RAYLEIGH_MEDIAN, 1e-9)
+        cut = huber * noise
+        for f in range(n_free):
+            weight[f] = prior_weight[f] * noise * noise
+        cost = _loss(norm, use, cut) + _prior_loss(p, free, prior_mean, weight)
+        _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, gradient)
+        for f in range(n_free):
+            gradient[f] += weight[f] * (p[free[f]] - prior_mean[f]) * scale[f]
+            normal[f, f] += weight[f] * scale[f] * scale[f]
+            pushed = (p[free[f]] <= low[f] and gradient[f] > 0.0) or (p[free[f]] >= high[f] and gradient[f] < 0.0)
+            if pushed or normal[f, f] <= 0.0:
+                for g in range(n_free):
+                    normal[f, g] = normal[g, f] = 0.0
+                normal[f, f] = 1.0
+                gradient[f] = 0.0
+        improved = False
+        gain = 0.0
+        for _ in range(12):
+            for f in range(n_free):
+                for g in range(n_free):
+                    damped[f, g] = normal[f, g]
+                damped[f, f] *= 1.0 + damping
+                step[f] = -gradient[f]
+            if _cholesky_solve(damped, step):
+                for f in range(n_free):
+                    value = p[free[f]] + step[f] * scale[f]
+                    trial[free[f]] = min(max(value, low[f]), high[f])
+                _residuals(trial, k, count, row, use, r_new)
+                _median_norm(r_new, use, norm_new)
+                fresh = _loss(norm_new, use, cut) + _prior_loss(trial, free, prior_mean, weight)
+                if fresh <= cost:
+                    improved = True
+                    gain = cost - fresh
+                    break
+            damping = min(max(damping, 1e-6) * 8.0, 1e12)
+        if not improved:
+            return iteration + 1, noise
+        damping = max(damping * 0.1, 1e-9)
+        for f in range(n_free):
+            p[free[f]] = trial[free[f]]
+        for i in range(m):
+            for j in range(3):
+                r[i, j] = r_new[i, j]
+        if gain <= 1e-11 * cost + 1e-22:
+            return iteration + 1, noise
+    return -max_iteration, noise
+
+
+@kernel_parallel
+def fit_batch(start, k, count, row, use, free, scale, low, high, mean, weight, huber, sigma_known, max_iteration):
+    """Fit many heliostats; returns parameters, iterations and noise in units of the stated sigma."""
+    p = start.copy()
+    iterations = np.empty(len(p), np.int64)
+    noise = np.empty(len(p))
+    for h in nb.prange(len(p)):
+        done, sigma = _fit_one(
+            p[h], k[h], count[h], row[h], use[h], free, scale, low[h], high[h], mean[h], weight,
+            huber, sigma_known, max_iteration,
+        )  # fmt: skip
+        iterations[h] = done
+        noise[h] = sigma
+    return p, iterations, noise

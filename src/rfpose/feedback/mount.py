@@ -1,0 +1,424 @@
+"""The two-axis mount: from motor positions to the mirror's centre and normal, and back.
+
+One model serves every mount whose two axes nearly cross at a right angle: azimuth over elevation, an axis 1 that
+lies level (as in Jülich), a polar axis. What differs is the nominal direction of axis 1, ``rot_enu_from_mount``.
+Angles of the axes are those of an azimuth-elevation mount in that frame: axis 1 turns clockwise seen along −z
+from the frame's y, axis 2 lifts the normal towards its z.
+
+From the mirror outwards: canting, arms, axis 2, non-orthogonality, axis 1, nominal frame, twist and tilt of the
+pedestal (towards north first, then towards east), gravity sag, location. Each parameter is zero in a perfect
+mount except lengths that exist anyway.
+
+References
+----------
+Malan, A heliostat field control system, (4.7)-(4.27), (6.1). Gouws, Calibration of heliostats using a drone,
+(5.26)-(5.49). Edwards, Arrays of paraboloidal collectors, ch. 5.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
+from rfpose.errors import InvalidInputError
+from rfpose.feedback import _kernels
+
+__all__ = [
+    "PARAMETERS",
+    "Actuator",
+    "CommandStatus",
+    "Commands",
+    "Mount",
+    "Posture",
+    "command",
+    "mount_frame_from_axis",
+    "posture",
+    "reflect",
+    "target_offset_m",
+]
+
+PARAMETERS: dict[str, float] = {
+    "pedestal_tilt_north_rad": 1e-3,
+    "pedestal_tilt_east_rad": 1e-3,
+    "pedestal_twist_rad": 1e-3,
+    "axis_1_zero_rad": 1e-3,
+    "axis_2_zero_rad": 1e-3,
+    "nonorthogonality_rad": 1e-3,
+    "canting_up_rad": 1e-3,
+    "canting_right_rad": 1e-3,
+    "location_east_m": 1e-2,
+    "location_north_m": 1e-2,
+    "location_up_m": 1e-2,
+    "pylon_length_m": 1e-1,
+    "arm_normal_m": 1e-2,
+    "arm_up_m": 1e-2,
+    "arm_right_m": 1e-2,
+    "axis_offset_m": 1e-2,
+    "axis_1_gain": 1e-3,
+    "axis_2_gain": 1e-3,
+    "actuator_1_stroke_m": 1e-3,
+    "actuator_2_stroke_m": 1e-3,
+    "actuator_1_radius_m": 1e-3,
+    "actuator_2_radius_m": 1e-3,
+    "actuator_1_offset_m": 1e-3,
+    "actuator_2_offset_m": 1e-3,
+    "worm_1_sin_rad": 1e-3,
+    "worm_1_cos_rad": 1e-3,
+    "worm_2_sin_rad": 1e-3,
+    "worm_2_cos_rad": 1e-3,
+    "gravity_sag_rad": 1e-3,
+    "receiver_plane_up_rad": 1e-3,
+    "receiver_plane_right_rad": 1e-3,
+}
+"""Every parameter of a mount, in the kernels' order, with the size of a usual change (it scales the fit)."""
+
+_NAMES = tuple(PARAMETERS)
+
+
+class CommandStatus(IntEnum):
+    """What became of a wanted posture."""
+
+    OK = 0
+    NO_SOLUTION = 1
+    BEYOND_LIMITS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Actuator:
+    """The drive of one axis.
+
+    Attributes
+    ----------
+    kind
+        ``"rotary"``: travel is an angle. ``"linear"``: a spindle that closes a triangle with two fixed sides; the
+        axis turns by the change of the angle between them.
+    counts_per_unit
+        Counts for one radian (rotary) or one metre (linear).
+    sign
+        +1 if the axis angle grows with the count, −1 if it falls.
+    angle_at_zero_rad
+        Nominal axis angle at count zero [rad].
+    stroke_m, radius_m, offset_m
+        Linear: length of the spindle at count zero and the two fixed sides of the triangle [m].
+    limits_count
+        Lowest and highest count.
+    worm_ratio
+        Turns of the worm for one turn of the axis (30 for Malan's, a period of 12°).
+
+    Raises
+    ------
+    InvalidInputError
+        A count scale or side that is not positive, a sign other than ±1, limits that are not ascending, or a
+        triangle that does not close at count zero.
+    """
+
+    kind: Literal["rotary", "linear"] = "rotary"
+    counts_per_unit: float = 1.0
+    sign: int = 1
+    angle_at_zero_rad: float = 0.0
+    stroke_m: float = 0.0
+    radius_m: float = 0.0
+    offset_m: float = 0.0
+    limits_count: tuple[float, float] = (-np.inf, np.inf)
+    worm_ratio: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("rotary", "linear"):
+            raise InvalidInputError(f"`kind` must be 'rotary' or 'linear', got {self.kind!r}")
+        if self.sign not in (-1, 1):
+            raise InvalidInputError(f"`sign` must be 1 or -1, got {self.sign!r}")
+        as_positive("counts_per_unit", self.counts_per_unit)
+        if not self.limits_count[0] < self.limits_count[1]:
+            raise InvalidInputError(f"`limits_count` must be ascending, got {self.limits_count}")
+        if self.kind == "linear":
+            sides = (
+                as_positive("stroke_m", self.stroke_m),
+                as_positive("radius_m", self.radius_m),
+                as_positive("offset_m", self.offset_m),
+            )
+            if 2.0 * max(sides) > sum(sides):
+                raise InvalidInputError(
+                    f"`stroke_m`, `radius_m` and `offset_m` must close a triangle, got {sides} m; "
+                    "check that all are metres"
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mount:
+    """One heliostat: where it stands, how its axes lie, how they are driven, and what is not as planned.
+
+    Attributes
+    ----------
+    pivot_enu_m : (xyz)
+        Nominal crossing point of the axes, site ENU [m].
+    rot_enu_from_mount : (3, 3)
+        Nominal directions of the mount's x, y, z in ENU (columns); z is axis 1. Unit matrix: azimuth-elevation.
+    actuators
+        Drives of axis 1 and axis 2.
+    parameters
+        Values by name of `PARAMETERS`; what is left out is zero, or the actuator's nominal side.
+    """
+
+    pivot_enu_m: FloatArray
+    rot_enu_from_mount: FloatArray = field(default_factory=lambda: np.eye(3))
+    actuators: tuple[Actuator, Actuator] = (Actuator(), Actuator())
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        rot = as_float_array("rot_enu_from_mount", self.rot_enu_from_mount, (3, 3))
+        if not np.allclose(rot @ rot.T, np.eye(3), atol=1e-9) or np.linalg.det(rot) < 0.0:
+            raise InvalidInputError("`rot_enu_from_mount` must be a right-handed rotation matrix")
+        object.__setattr__(self, "rot_enu_from_mount", read_only(rot))
+        pivot = as_float_array("pivot_enu_m", self.pivot_enu_m, (3,))
+        object.__setattr__(self, "pivot_enu_m", read_only(pivot))
+        values = self._nominal() | {name: float(value) for name, value in self.parameters.items()}
+        check_names(values)
+        bad = [name for name, value in values.items() if not np.isfinite(value)]
+        if bad:
+            raise InvalidInputError(f"`parameters` must be finite, got {bad[0]} = {values[bad[0]]}")
+        object.__setattr__(self, "parameters", {name: values.get(name, 0.0) for name in _NAMES})
+
+    def _nominal(self) -> dict[str, float]:
+        """Sides of the actuators' triangles as built."""
+        sides: dict[str, float] = {}
+        for i, actuator in enumerate(self.actuators, start=1):
+            if actuator.kind == "linear":
+                sides[f"actuator_{i}_stroke_m"] = actuator.stroke_m
+                sides[f"actuator_{i}_radius_m"] = actuator.radius_m
+                sides[f"actuator_{i}_offset_m"] = actuator.offset_m
+        return sides
+
+    def replace(self, **parameters: float) -> Mount:
+        """Return the mount with some parameters changed."""
+        return dataclasses.replace(self, parameters={**self.parameters, **parameters})
+
+    def parameter_vector(self) -> FloatArray:
+        """Parameters in the order of `PARAMETERS`."""
+        return np.array([self.parameters[name] for name in _NAMES])
+
+    def constant_vector(self) -> FloatArray:
+        """What a calibration does not change, as the kernels read it."""
+        first, second = self.actuators
+        return np.concatenate(
+            [
+                self.rot_enu_from_mount.ravel(),
+                [float(a.kind == "linear") for a in self.actuators],
+                [a.sign for a in self.actuators],
+                [a.counts_per_unit for a in self.actuators],
+                [a.angle_at_zero_rad for a in self.actuators],
+                [a.worm_ratio for a in self.actuators],
+                self.pivot_enu_m,
+                first.limits_count,
+                second.limits_count,
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Posture:
+    """Where mirrors are and face; rows as the motor positions given.
+
+    Attributes
+    ----------
+    axis_rad : (..., axis)
+        Angles of axis 1 and axis 2 [rad].
+    normal_enu : (..., xyz)
+        Mirror normals; NaN where a linear actuator's triangle does not close.
+    centre_enu_m : (..., xyz)
+        Mirror centres, site ENU [m].
+    """
+
+    axis_rad: FloatArray
+    normal_enu: FloatArray
+    centre_enu_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Commands:
+    """Motor positions for wanted postures.
+
+    Attributes
+    ----------
+    count : (..., axis)
+        Motor positions; NaN where there is no solution. Beyond the limits the wanted value is given.
+    status : (...)
+        `CommandStatus` of each.
+    """
+
+    count: FloatArray
+    status: npt.NDArray[np.int8]
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Refuse names that are no parameter of a mount."""
+    unknown = [name for name in names if name not in PARAMETERS]
+    if unknown:
+        raise InvalidInputError(f"no mount parameter is called {unknown[0]!r}; known are {', '.join(_NAMES)}")
+
+
+def mount_frame_from_axis(axis_enu: npt.ArrayLike, zero_enu: npt.ArrayLike) -> FloatArray:
+    """Return ``rot_enu_from_mount`` of a mount whose axis 1 and zero direction are known.
+
+    Parameters
+    ----------
+    axis_enu : (xyz)
+        Direction of axis 1 (the fixed axis); need not be of unit length. For an axis at latitude B and longitude
+        offset l (Edwards), the direction in the site frame of a plumb line there.
+    zero_enu : (xyz)
+        Direction towards which the normal leans at axis 1's zero; its part along the axis is dropped.
+
+    Raises
+    ------
+    InvalidInputError
+        The two directions are parallel.
+    """
+    z = geometry.unit(as_float_array("axis_enu", axis_enu, (3,)))
+    zero = as_float_array("zero_enu", zero_enu, (3,))
+    x = np.cross(zero, z)
+    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(zero):
+        raise InvalidInputError("`axis_enu` and `zero_enu` must not be parallel")
+    x = geometry.unit(x)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def posture(mount: Mount, count: npt.ArrayLike, *, receiver_plane: bool = False) -> Posture:
+    """Return centre and normal of the mirror at motor positions.
+
+    Parameters
+    ----------
+    mount
+        The heliostat.
+    count : (..., axis)
+        Motor positions; with ``counts_per_unit`` one, axis angles [rad].
+    receiver_plane
+        Give the normal of the receivers' plane and not the mirror's.
+    """
+    counts = as_float_array("count", count, ("...", 2), finite=False)
+    out = _kernels.posture_batch(
+        mount.parameter_vector()[None],
+        mount.constant_vector()[None],
+        np.ascontiguousarray(counts.reshape(1, -1, 2)),
+        1.0 if receiver_plane else 0.0,
+    ).reshape(*counts.shape[:-1], 8)
+    return Posture(axis_rad=out[..., :2], normal_enu=out[..., 2:5], centre_enu_m=out[..., 5:])
+
+
+def aim_rows(
+    source_enu: FloatArray, target_enu: FloatArray, *, source_is_point: bool, target_is_point: bool
+) -> FloatArray:
+    """Rows of sources and targets as the kernels read them."""
+    source, target = np.broadcast_arrays(source_enu, target_enu)
+    rows = np.zeros((*source.shape[:-1], _kernels.N_ROW))
+    rows[..., 0:3], rows[..., 3] = source, source_is_point
+    rows[..., 4:7], rows[..., 7] = target, target_is_point
+    rows[..., 8] = 1.0
+    return rows
+
+
+def command(
+    mount: Mount,
+    *,
+    sun_enu: npt.ArrayLike,
+    target_enu_m: npt.ArrayLike | None = None,
+    mode: Literal["heliostat", "dish"] = "heliostat",
+) -> Commands:
+    """Return the motor positions that send the sun to a target, every known error of the mount undone.
+
+    Parameters
+    ----------
+    mount
+        The heliostat as calibrated.
+    sun_enu : (..., xyz)
+        Directions towards the sun.
+    target_enu_m : (..., xyz)
+        Aim points, site ENU [m]; heliostats only.
+    mode
+        ``"heliostat"``: the normal bisects sun and target, seen from the mirror's centre as it then is.
+        ``"dish"``: the normal points at the sun.
+
+    Raises
+    ------
+    InvalidInputError
+        No target for a heliostat, one for a dish, or wrong shapes.
+    """
+    sun = geometry.unit(as_float_array("sun_enu", sun_enu, ("...", 3)))
+    if (mode == "heliostat") != (target_enu_m is not None):
+        raise InvalidInputError("`target_enu_m` must be given for mode 'heliostat' and only for it")
+    target = sun if target_enu_m is None else as_float_array("target_enu_m", target_enu_m, ("...", 3))
+    rows = aim_rows(sun, target, source_is_point=False, target_is_point=target_enu_m is not None)
+    shape = rows.shape[:-1]
+    count, status = _kernels.command_batch(
+        mount.parameter_vector()[None],
+        mount.constant_vector()[None],
+        np.ascontiguousarray(rows.reshape(1, -1, _kernels.N_ROW)),
+    )
+    return Commands(count=count.reshape(*shape, 2), status=status.reshape(shape))
+
+
+def reflect(normal_enu: npt.ArrayLike, sun_enu: npt.ArrayLike) -> FloatArray:
+    """Return the direction into which a mirror sends the sun.
+
+    Parameters
+    ----------
+    normal_enu, sun_enu : (..., xyz)
+        Mirror normal and direction towards the sun.
+
+    Returns
+    -------
+    (..., xyz)
+        Unit vectors; NaN where the sun is behind the mirror.
+    """
+    normal, sun = geometry.unit(normal_enu), geometry.unit(sun_enu)
+    cosine = np.sum(normal * sun, axis=-1, keepdims=True)
+    return np.asarray(np.where(cosine > 0.0, 2.0 * cosine * normal - sun, np.nan))
+
+
+def target_offset_m(
+    centre_enu_m: npt.ArrayLike,
+    beam_enu: npt.ArrayLike,
+    *,
+    target_enu_m: npt.ArrayLike,
+    target_normal_enu: npt.ArrayLike,
+) -> FloatArray:
+    """Return where beams meet a plane target, from its centre [m].
+
+    Parameters
+    ----------
+    centre_enu_m, beam_enu : (..., xyz)
+        Mirror centres [m] and directions of the beams.
+    target_enu_m : (xyz)
+        Centre of the target.
+    target_normal_enu : (xyz)
+        Outward normal of the target's plane, tilted or not; Malan's (4.22) is the direction towards the heliostat.
+
+    Returns
+    -------
+    (..., 2)
+        Right and up, as seen looking at the target from in front [m]; NaN where the beam misses the plane's front.
+    """
+    centre = as_float_array("centre_enu_m", centre_enu_m, ("...", 3), finite=False)
+    beam = geometry.unit(beam_enu)
+    target = as_float_array("target_enu_m", target_enu_m, (3,))
+    right, up, normal = np.moveaxis(geometry.rot_enu_from_mirror(target_normal_enu), -1, 0)
+    against = -np.sum(beam * normal, axis=-1)
+    height = np.sum((centre - target) * normal, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where((against > 1e-9) & (height > 0.0), height / against, np.nan)
+    hit = centre + distance[..., None] * beam - target
+    return np.stack([np.sum(hit * right, axis=-1), np.sum(hit * up, axis=-1)], axis=-1)
+
+
+def stack_mounts(mounts: Sequence[Mount]) -> tuple[FloatArray, FloatArray]:
+    """Return parameters and constants of many mounts as the kernels read them."""
+    return (
+        np.stack([mount.parameter_vector() for mount in mounts]),
+        np.stack([mount.constant_vector() for mount in mounts]),
+    )
