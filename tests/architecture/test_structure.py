@@ -1,5 +1,6 @@
 """What holds for the tree as a whole."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -33,3 +34,20 @@ def test_numba_stays_behind_its_door(path):
 def test_only_the_command_line_prints(path):
     if "cli" not in path.parts:
         assert not re.search(r"^\s*print\(", path.read_text(), re.M)
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in SOURCES if p.name == "_kernels.py"], ids=lambda p: str(p.relative_to(ROOT / "src"))
+)
+def test_reordered_sums_are_not_called_from_kernels(path):
+    """A callee is compiled on its own and again inside its caller; where sums may be reordered the two differ.
+
+    Which of them runs depends on whether the caller came from the cache, so that equal runs would give unequal bytes.
+    Inline such a piece (`kernel_inline`) or call it from Python only.
+    """
+    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    decorators = {f.name: {d.id for d in f.decorator_list if isinstance(d, ast.Name)} for f in functions}
+    fast = {name for name, names in decorators.items() if names & {"kernel_fast", "kernel_parallel_fast"}}
+    for function in functions:
+        called = {n.func.id for n in ast.walk(function) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
+        assert not called & fast, f"{function.name} calls {called & fast}"

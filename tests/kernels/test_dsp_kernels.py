@@ -43,13 +43,12 @@ def test_inspect_counts_what_is_wrong():
     samples[6] = 0, -2000
     samples[7] = -32768, -32768
     samples[256:512] = 0
-    for (energy, clipped, fill, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
-        assert energy == pytest.approx(np.sum(samples.astype(float) ** 2), rel=1e-6)
+    for (clipped, fill, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
         assert (clipped, fill, zero) == (2, 1, 256)
     floats = samples.astype(np.float32)
     floats[8, 1] = np.nan
     floats[9, 0] = -np.inf
-    for (_, clipped, bad, zero), _ in both(_kernels.inspect_f32, floats.ravel(), 2000.0, 256):
+    for (clipped, bad, zero), _ in both(_kernels.inspect_f32, floats.ravel(), 2000.0, 256):
         assert (clipped, bad, zero) == (3, 2, 256)
 
 

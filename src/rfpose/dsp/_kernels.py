@@ -1,4 +1,8 @@
-"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs travel as int32."""
+"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs travel as int32.
+
+Where sums may be reordered the inner loop is inlined, not called: a called one is compiled once on its own and once
+inside its caller, and which of the two runs would depend on whether the caller came from the cache.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,10 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_fast
+from rfpose.jit import kernel, kernel_fast, kernel_inline
 
 
-@kernel_fast
+@kernel_inline
 def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
     """Weight one block, add its n_fold stretches of ``period`` samples: out = [re(period), im(period)]."""
     for j in range(2 * period):
@@ -30,7 +34,7 @@ def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
             im[j] += i * gi[j] + q * gr[j]
 
 
-@kernel_fast
+@kernel_inline
 def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
     """Like `_fold_block_i16` for complex64 samples."""
     for j in range(2 * period):
@@ -49,7 +53,7 @@ def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
             im[j] += i * gi[j] + q * gr[j]
 
 
-@kernel
+@kernel_fast
 def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
     """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
     n_tap = n_fold * period
@@ -57,7 +61,7 @@ def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
         _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
 
 
-@kernel
+@kernel_fast
 def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
     """Like `fold_i16` for (sample,) complex64."""
     n_tap = n_fold * period
@@ -65,21 +69,18 @@ def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
         _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
 
 
-@kernel_fast
-def _segment_i16(flat):
-    """Return energy, smallest and largest component of a short stretch."""
-    energy = np.float32(0.0)
+@kernel
+def _extremes_i16(flat):
+    """Return the smallest and the largest component of a short stretch."""
     lowest = np.int16(0)
     highest = np.int16(0)
     for j in range(flat.size):
         v = flat[j]
-        f = np.float32(v)
-        energy += f * f
         if v > highest:
             highest = v
         if v < lowest:
             lowest = v
-    return energy, lowest, highest
+    return lowest, highest
 
 
 @kernel
@@ -99,56 +100,43 @@ def _count_i16(flat, limit):
 
 @kernel
 def inspect_i16(flat, limit, segment):
-    """Return (energy, clipped, fill, samples in all-zero segments); ``limit`` is full scale in counts."""
-    n_part = (flat.size // 2 + segment - 1) // segment
-    energy = np.zeros(n_part)
-    count = np.zeros((n_part, 3), np.int64)
-    for p in range(n_part):
-        part = flat[2 * p * segment : min(2 * (p + 1) * segment, flat.size)]
-        e, lowest, highest = _segment_i16(part)
-        energy[p] = e
+    """Return (clipped, fill, samples in all-zero segments); ``limit`` is full scale in counts."""
+    clipped = 0
+    fill = 0
+    zero = 0
+    for first in range(0, flat.size, 2 * segment):
+        part = flat[first : min(first + 2 * segment, flat.size)]
+        lowest, highest = _extremes_i16(part)
         if highest >= limit or lowest <= -limit:
             n_clip, n_fill = _count_i16(part, limit)
-            count[p, 0] = n_clip
-            count[p, 1] = n_fill
-        if lowest == 0 and highest == 0:
-            count[p, 2] = part.size // 2
-    return energy.sum(), count[:, 0].sum(), count[:, 1].sum(), count[:, 2].sum()
-
-
-@kernel
-def _segment_f32(flat, limit):
-    energy = 0.0
-    n_clip = 0
-    n_bad = 0
-    n_zero = 0
-    for j in range(0, flat.size, 2):
-        i = np.float64(flat[j])
-        q = np.float64(flat[j + 1])
-        if math.isfinite(i) and math.isfinite(q):
-            energy += i * i + q * q
-            n_clip += abs(i) >= limit or abs(q) >= limit
-            n_zero += i == 0.0 and q == 0.0
-        else:
-            n_bad += 1
-    return energy, n_clip, n_bad, n_zero
+            clipped += n_clip
+            fill += n_fill
+        elif lowest == 0 and highest == 0:
+            zero += part.size // 2
+    return clipped, fill, zero
 
 
 @kernel
 def inspect_f32(flat, limit, segment):
-    """Return (energy, clipped, not finite, samples in all-zero segments) over interleaved float32 I and Q."""
-    n_part = (flat.size // 2 + segment - 1) // segment
-    energy = np.zeros(n_part)
-    count = np.zeros((n_part, 3), np.int64)
-    for p in range(n_part):
-        part = flat[2 * p * segment : min(2 * (p + 1) * segment, flat.size)]
-        e, n_clip, n_bad, n_zero = _segment_f32(part, limit)
-        energy[p] = e
-        count[p, 0] = n_clip
-        count[p, 1] = n_bad
-        if 2 * n_zero == part.size:
-            count[p, 2] = n_zero
-    return energy.sum(), count[:, 0].sum(), count[:, 1].sum(), count[:, 2].sum()
+    """Return (clipped, not finite, samples in all-zero segments) over interleaved float32 I and Q."""
+    clipped = 0
+    bad = 0
+    zero = 0
+    for first in range(0, flat.size, 2 * segment):
+        last = min(first + 2 * segment, flat.size)
+        n_zero = 0
+        for j in range(first, last, 2):
+            i = flat[j]
+            q = flat[j + 1]
+            if not (math.isfinite(i) and math.isfinite(q)):
+                bad += 1
+            elif abs(i) >= limit or abs(q) >= limit:
+                clipped += 1
+            elif i == 0.0 and q == 0.0:
+                n_zero += 1
+        if 2 * n_zero == last - first:
+            zero += n_zero
+    return clipped, bad, zero
 
 
 @kernel_fast

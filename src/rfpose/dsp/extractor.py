@@ -156,10 +156,10 @@ class ToneExtractor:
         flat = x.reshape(-1)
         if x.dtype == np.int16:
             limit = min(self.full_scale, 32767.0)
-            _, n_clip, n_fill, n_zero = _kernels.inspect_i16(flat, np.int16(limit), _ZERO_SEGMENT)
+            n_clip, n_fill, n_zero = _kernels.inspect_i16(flat, np.int16(limit), _ZERO_SEGMENT)
             n_bad = 0
         else:
-            _, n_clip, n_bad, n_zero = _kernels.inspect_f32(flat, self.full_scale, _ZERO_SEGMENT)
+            n_clip, n_bad, n_zero = _kernels.inspect_f32(flat, self.full_scale, _ZERO_SEGMENT)
             n_fill = 0
         clipped = n_clip / len(x)
         if n_bad:

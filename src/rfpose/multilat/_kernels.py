@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.jit import kernel, kernel_fast, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -89,7 +89,7 @@ def load_group(
         ws[SEEN + lane] = seen
 
 
-@kernel_fast
+@kernel
 def _moments(transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray) -> None:
     """Add transmitters ``t`` and ``t + 1`` to the moments of the linear equations (see `start_group`)."""
     ax, ay, az = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
@@ -133,7 +133,7 @@ def _moments(transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, 
         ws[GC + lane] += qad * sa + qbd * sb
 
 
-@kernel_fast
+@kernel
 def _solve_linear(planar: float, ws: FloatArray) -> None:
     """Solve each lane's linear equations for position and clock."""
     for lane in range(LANES):
@@ -217,7 +217,7 @@ def start_given(
         ws[C + lane] = total / q_total
 
 
-@kernel_fast
+@kernel
 def _normal_equations(transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray) -> None:
     """Add transmitters ``t`` and ``t + 1`` to JᵀWJ and JᵀWε. Two at a time halve the traffic of the sums."""
     ax, ay, az = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
@@ -269,7 +269,7 @@ def _normal_equations(transmitter: FloatArray, t: int, delta: FloatArray, w: Flo
         ws[W + lane] += qu + qv
 
 
-@kernel_fast
+@kernel
 def _invert(planar: float, ws: FloatArray) -> None:
     """Eliminate the clock and invert what is left; a singular lane is marked."""
     for lane in range(LANES):
@@ -299,7 +299,7 @@ def _invert(planar: float, ws: FloatArray) -> None:
         ws[QZZ + lane] = (mxx * myy - mxy * mxy) * idet
 
 
-@kernel_fast
+@kernel
 def _step(tolerance2: float, relax: float, ws: FloatArray) -> float:
     """Take each active lane's Gauss-Newton step and return how many lanes are still on their way.
 
@@ -371,7 +371,7 @@ def iterate_group(
             break
 
 
-@kernel_fast
+@kernel
 def _residuals(
     transmitter: FloatArray, t: int, delta: FloatArray, w: FloatArray, ws: FloatArray, residual: FloatArray
 ) -> None:
@@ -386,7 +386,7 @@ def _residuals(
         ws[CHI2 + lane] += w[t, lane] * error * error
 
 
-@kernel_fast
+@kernel
 def _unequal(n_transmitter: int, w: FloatArray, ws: FloatArray) -> float:
     """Count lanes whose received transmitters differ in weight; each lane's largest weight goes to DOP2."""
     for lane in range(LANES):

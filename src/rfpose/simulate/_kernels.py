@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.jit import kernel, kernel_fast
+from rfpose.jit import kernel, kernel_fast, kernel_inline
 
 __all__ = ["BLOCK", "sum_of_rays", "to_float32", "to_int16"]
 
@@ -45,14 +45,14 @@ def _rotations(step: Uint64) -> Float64:
     return rotation
 
 
-@kernel_fast
+@kernel_inline
 def _add_cosine(re: float, im: float, cos: Float64, sin: Float64, envelope: Float64) -> None:
     """Envelope += Re((re + j im)·(cos + j sin))."""
     for k in range(envelope.shape[0]):
         envelope[k] += re * cos[k] - im * sin[k]
 
 
-@kernel_fast
+@kernel_inline
 def _add_carrier(
     re: float, im: float, cos: Float64, sin: Float64, envelope: Float64, sum_re: Float64, sum_im: Float64
 ) -> None:
@@ -62,7 +62,7 @@ def _add_carrier(
         sum_im[k] += (re * sin[k] + im * cos[k]) * envelope[k]
 
 
-@kernel
+@kernel_fast
 def sum_of_rays(
     first: int,
     amplitude: Float64,
