@@ -124,7 +124,12 @@ class Mirror(_Record):
     receiver_mirror_m: tuple[Point, ...] | None = None
     arm_m: NonNegative = 0.0
     oscillator: Literal["shared", "separate"] = "shared"
+    receiver_delay_sigma_s: NonNegative | None = None
+    """How well the delays between a mirror's receivers are known; without it they are unknown in every frame."""
     pivot_sigma_m: Positive | None = None
+    """How well pivots are surveyed; without it they are not used."""
+    mount: Literal["free", "azimuth_elevation"] = "free"
+    """Whether orientation is held to a two-axis mount, whose mirror keeps its x axis horizontal."""
 
 
 class Heliostat(_Record):
@@ -136,7 +141,9 @@ class Heliostat(_Record):
     receiver_ids: tuple[Identifier, ...]
     arm_m: NonNegative = 0.0
     oscillator: Literal["shared", "separate"] = "shared"
+    receiver_delay_sigma_s: NonNegative | None = None
     pivot_sigma_m: Positive | None = None
+    mount: Literal["free", "azimuth_elevation"] = "free"
     normal_enu: Point | None = None
     """Posture for simulation; without it the mirror reflects the simulated sun onto the aim point."""
 

@@ -22,7 +22,7 @@ __all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "command"]
 
 # Written out so that --help need not load the signal processing; a test holds them to rfpose.dsp.
 ESTIMATOR_NAMES = ("hilbert", "correlator", "dot", "dot-compensated")
-POSE_NAMES = ("independent",)
+POSE_NAMES = ("rigid", "independent")
 
 
 @click.command(
@@ -46,9 +46,10 @@ POSE_NAMES = ("independent",)
 @click.option(
     "--pose",
     type=click.Choice(POSE_NAMES),
-    default="independent",
+    default="rigid",
     show_default=True,
-    help="How a mirror's normal follows from its receivers: each located on its own.",
+    help="How a mirror's normal follows: from all phases of its receivers at once, or from each receiver located on "
+    "its own, as published.",
 )
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @force_option

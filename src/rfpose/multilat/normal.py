@@ -28,6 +28,8 @@ class PoseStatus(IntEnum):
     TOO_FEW = 1
     COLLINEAR = 2
     RESIDUAL = 3
+    UNDETERMINED = 4
+    NOT_CONVERGED = 5
 
     @property
     def reason(self) -> str:
@@ -40,6 +42,8 @@ _REASON = {
     PoseStatus.TOO_FEW: "fewer than three receivers of the mirror were located",
     PoseStatus.COLLINEAR: "the located receivers lie on one line",
     PoseStatus.RESIDUAL: "solved, but a receiver's residuals are far above what the sigma of the ranges allows",
+    PoseStatus.UNDETERMINED: "the measurements leave part of the pose open; more transmitters or a surveyed pivot help",
+    PoseStatus.NOT_CONVERGED: "the pose did not converge",
 }
 
 

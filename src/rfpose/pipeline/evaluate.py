@@ -17,6 +17,7 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.geometry import angle_between_rad, unit
 from rfpose.multilat import FixStatus, PoseStatus, normal_bound, position_bound
 from rfpose.pipeline.result_file import Result, count_reasons, is_result, read_result
+from rfpose.pipeline.rigid import rigid_normal_bound
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
@@ -198,8 +199,9 @@ def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
 def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
     """Compare a result with the truth and with the bound.
 
-    The bound is that of receivers located each on its own, at the true geometry, with the noise of the receiver
-    and that of the calibration receivers (Cramér–Rao for each tone phase, position and normal).
+    The bound is that of the pose model in use, at the true geometry, with the noise of the receiver and that of the
+    calibration receivers (Cramér–Rao for each phase, position and normal). Positions are always those of receivers
+    located each on its own.
 
     Parameters
     ----------
@@ -228,9 +230,11 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
     normal_error = np.where(solved, angle_between_rad(result.poses.normal_enu, normal_true), np.nan)
     position_error = np.where(located, np.linalg.norm(result.fixes.position_enu_m - receiver_true, axis=-1), np.nan)
     own_m, calibration_m, source = _noise(result, truth, rows)
-    bound = np.where(
-        np.isfinite(normal_error), _normal_bound(result.scenario, receiver_true, own_m, calibration_m), np.nan
-    )
+    if result.settings.get("pose") == "rigid":
+        bound = rigid_normal_bound(result, truth, rows, normal_true)
+    else:
+        bound = _normal_bound(result.scenario, receiver_true, own_m, calibration_m)
+    bound = np.where(np.isfinite(normal_error), bound, np.nan)
     total_m = np.hypot(own_m, calibration_m)
     position_cov = position_bound(result.scenario.transmitter_enu_m, receiver_true, total_m)
     bound_m = np.where(np.isfinite(position_error), np.sqrt(np.trace(position_cov, axis1=-2, axis2=-1)), np.nan)

@@ -32,7 +32,7 @@ def process(
     *,
     scenario_path: str | Path | None = None,
     estimator: str = "hilbert",
-    pose: str = "independent",
+    pose: str = "rigid",
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,

@@ -11,13 +11,15 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.multilat import Fixes, Poses, RangeDifferences, check_unambiguous, range_differences, solve_poses
 from rfpose.multilat.fix import check_transmitters
 from rfpose.pipeline.result_file import FixTable, PoseTable, Result
+from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
 __all__ = ["POSES", "check_solvable", "solve"]
 
-POSES = ("independent",)
-"""Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's."""
+POSES = ("rigid", "independent")
+"""Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's, as
+published. ``rigid``: all phases of a mirror's receivers at once, with what the scenario says of clocks and pivots."""
 
 
 def check_solvable(scenario: Scenario, *, pose: str) -> None:
@@ -76,6 +78,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         receiver_mirror_m=[heliostat.receiver_mirror_m for heliostat in scenario.heliostat],
     )
     n_frame, n_receiver = tones.phase_rad.shape[:2]
+    fixes = _fix_table(poses.fixes, n_frame, n_receiver)
+    independent = _pose_table(poses)
     return Result(
         scenario=scenario,
         settings=settings,
@@ -83,8 +87,10 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         tones=tones,
         calibration=calibration,
         ranges=ranges,
-        fixes=_fix_table(poses.fixes, n_frame, n_receiver),
-        poses=_pose_table(poses),
+        fixes=fixes,
+        poses=solve_rigid_poses(tones, calibration, ranges, fixes, independent, scenario)
+        if settings["pose"] == "rigid"
+        else independent,
         truth=truth,
     )
 
