@@ -366,7 +366,9 @@ def _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, 
 
 
 @kernel
-def _fit_one(p, k, count, row, use, free, scale, low, high, prior_mean, prior_weight, huber, sigma_known, max_iteration):
+def _fit_one(
+    p, k, count, row, use, free, scale, low, high, prior_mean, prior_weight, huber, sigma_known, max_iteration
+):
     """Levenberg-Marquardt with Huber's loss, in place; returns iterations (negative: did not settle) and scale."""
     n_free = len(free)
     m = len(row)
@@ -431,7 +433,7 @@ def _fit_one(p, k, count, row, use, free, scale, low, high, prior_mean, prior_we
         for i in range(m):
             for j in range(3):
                 r[i, j] = r_new[i, j]
-        if gain <= 1e-11 * cost + 1e-22:
+        if gain <= 1e-9 * cost + 1e-22:
             return iteration + 1, noise
     return -max_iteration, noise
 

@@ -16,8 +16,9 @@ from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import erfc
 
-from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
+from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels
 from rfpose.feedback.measurements import Measurements
@@ -41,7 +42,7 @@ _PEDESTAL = ("pedestal_tilt_north_rad", "pedestal_tilt_east_rad")
 _ZEROS = ("axis_1_zero_rad", "axis_2_zero_rad")
 _LOCATION = ("location_up_m", "location_east_m", "location_north_m")
 _STROKES = ("actuator_1_stroke_m", "actuator_2_stroke_m")
-_PIVOTS = ("actuator_1_radius_m", "actuator_2_radius_m", "actuator_1_offset_m", "actuator_2_offset_m")
+_RADII = ("actuator_1_radius_m", "actuator_2_radius_m")
 _LEVEL = ("pedestal_tilt_east_rad", "pedestal_twist_rad")
 
 PARAMETER_SETS: dict[str, tuple[str, ...]] = {
@@ -55,8 +56,10 @@ PARAMETER_SETS: dict[str, tuple[str, ...]] = {
         *_LOCATION, *_PEDESTAL, *_ZEROS, "arm_normal_m", "arm_up_m",
     ),
     "level-4": (*_LEVEL, *_ZEROS),
+    "level-7": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES),
     "level-8": (*_PEDESTAL, "pedestal_twist_rad", *_ZEROS, "nonorthogonality_rad", *_STROKES),
-    "full": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", "canting_right_rad", *_LOCATION, *_STROKES, *_PIVOTS),
+    "level-location": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES, *_LOCATION, *_RADII),
+    "level-full": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES, "canting_right_rad", *_LOCATION),
 }  # fmt: skip
 """Usual sets of free parameters. ``level-…`` are for an axis 1 that lies east-west, as PAINT's."""
 
@@ -89,7 +92,8 @@ class FitSettings:
         The measurements' sigmas are absolute. Otherwise they only weigh the measurements against each other and
         the noise is estimated from the residuals.
     huber
-        Residuals beyond this many sigma count linearly. Infinity: plain least squares.
+        Residuals beyond this many sigma count linearly. One loses 11 % of the information if the noise is
+        Gaussian, and is the better for it where the model's own errors dominate. Infinity: plain least squares.
     bounds
         Lowest and highest value by parameter.
     priors
@@ -106,7 +110,7 @@ class FitSettings:
     """
 
     sigma_known: bool = False
-    huber: float = 2.5
+    huber: float = 1.0
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rank_tolerance: float = 1e-5
@@ -146,7 +150,10 @@ class FieldCalibration:
     condition : (heliostat,)
         Largest over smallest singular value among those that count.
     ambiguity : (heliostat, free, free)
-        Projection onto what is undetermined; zero where all is determined.
+        Projection onto what is undetermined, for columns of the Jacobian of length one; zero where all is
+        determined.
+    column_length : (heliostat, free)
+        Lengths of the Jacobian's columns, in sigma by unit of the parameter.
     noise : (heliostat,)
         Sigma of the residuals in units of the stated sigma: estimated, or one.
     iterations : (heliostat,)
@@ -163,12 +170,13 @@ class FieldCalibration:
     rank: npt.NDArray[np.int64]
     condition: FloatArray
     ambiguity: FloatArray
+    column_length: FloatArray
     noise: FloatArray
     iterations: npt.NDArray[np.int64]
     status: npt.NDArray[np.int8]
 
     def undetermined(self, heliostat: int) -> tuple[tuple[str, ...], ...]:
-        """Groups of parameters that a heliostat's data cannot tell apart; a group of one is not seen at all."""
+        """Name groups of parameters that a heliostat's data cannot tell apart; a group of one is not seen at all."""
         linked = np.abs(self.ambiguity[heliostat]) > 0.02
         left = [i for i in range(len(self.free)) if linked[i, i]]
         groups = []
@@ -245,13 +253,16 @@ class Prediction:
     ----------
     normal_enu : (posture, xyz)
         Modelled normals.
+    error_rad : (posture,)
+        Angle between the modelled normal and the one that the posture's source and target ask for [rad].
     cov_enu_rad2 : (posture, xyz, xyz)
-        From the uncertainty of the parameters [rad²].
+        Of that difference, from the uncertainty of the parameters [rad²].
     sigma_rad : (posture,)
-        Root of the trace: RMS angle by which the model is uncertain [rad].
+        Root of its trace: RMS angle by which the model is uncertain [rad].
     """
 
     normal_enu: FloatArray
+    error_rad: FloatArray
     cov_enu_rad2: FloatArray
     sigma_rad: FloatArray
 
@@ -412,11 +423,14 @@ def solve(
     )  # fmt: skip
     status = np.where(iterations < 0, FitStatus.NOT_SETTLED, FitStatus.OK).astype(np.int8)
     status[~enough] = FitStatus.TOO_FEW
+    if not settings.sigma_known:
+        components = 2.0 * masked.sum(axis=1)
+        noise *= np.sqrt(components / np.maximum(components - len(free), 1.0))
     working = fitted[:, index]
     working[~enough] = np.nan
     noise[~enough] = np.nan
     known = _uncertainty(fitted, k, count, row, masked, index, scale, noise, weight, settings)
-    covariance, ambiguity, rank, condition = known
+    covariance, ambiguity, rank, condition, length = known
     blind = np.einsum("hff->hf", ambiguity) > 0.02
     sigma = np.sqrt(np.einsum("hff->hf", covariance))
     sigma[blind] = np.inf
@@ -431,6 +445,7 @@ def solve(
         rank=read_only(rank),
         condition=read_only(condition),
         ambiguity=read_only(ambiguity),
+        column_length=read_only(length),
         noise=read_only(noise),
         iterations=read_only(np.abs(iterations)),
         status=read_only(status),
@@ -478,8 +493,8 @@ def _uncertainty(
     noise: FloatArray,
     prior_weight: FloatArray,
     settings: FitSettings,
-) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray]:
-    """Covariance, projection onto what is undetermined, rank and condition; in blocks, to bound the memory."""
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray]:
+    """Covariance, projection onto what is undetermined, rank, condition, lengths; in blocks, to bound the memory."""
     parts = []
     block = max(1, 4_000_000 // (row.shape[1] * 3 * len(index)))
     for i in range(0, len(p), block):
@@ -487,20 +502,36 @@ def _uncertainty(
         residual = _kernels.residuals_batch(p[s], k[s], count[s], row[s], use[s])
         jacobian = _kernels.jacobian_batch(p[s], k[s], count[s], row[s], use[s], index, scale)
         norm = np.linalg.norm(residual, axis=-1)
-        cut = settings.huber * noise[s, None]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            weight = np.where(norm <= cut, 1.0, np.sqrt(cut / norm))
-        jacobian *= (np.where(use[s], weight, 0.0) / noise[s, None])[..., None, None]
+        spread = _efficiency(norm / noise[s, None], use[s], settings) * noise[s] ** 2
+        jacobian *= (use[s] / np.sqrt(spread)[:, None])[..., None, None]
         prior = np.broadcast_to(np.diag(np.sqrt(prior_weight)), (len(jacobian), len(index), len(index)))
         rows = np.concatenate([jacobian.reshape(len(jacobian), -1, len(index)), prior], axis=1)
         parts.append(_subspaces(np.nan_to_num(rows), settings.rank_tolerance))
-    covariance, ambiguity, rank, condition = (np.concatenate(items) for items in zip(*parts, strict=True))
-    return covariance, ambiguity, rank, condition
+    covariance, ambiguity, rank, condition, length = (np.concatenate(items) for items in zip(*parts, strict=True))
+    return covariance, ambiguity, rank, condition, length
+
+
+def _efficiency(norm: FloatArray, use: npt.NDArray[np.bool_], settings: FitSettings) -> FloatArray:
+    """Variance of Huber's estimate over that of least squares on the same Jacobian, both for sigma one.
+
+    Mean square of the loss's slope over the squared mean of its curvature, in two dimensions: expected for Gaussian
+    noise where sigma is known, else of the residuals themselves.
+    """
+    cut = settings.huber
+    if settings.sigma_known:
+        tail = float(np.exp(-0.5 * cut**2))
+        linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0
+        return np.full(len(norm), (1.0 - tail) / (1.0 - tail + linear) ** 2)
+    n = np.maximum(use.sum(axis=1), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curvature = np.where(norm <= cut, 1.0, 0.5 * cut / norm)
+    slope = 0.5 * np.sum(np.where(use, np.minimum(norm, cut) ** 2, 0.0), axis=1) / n
+    return np.asarray(slope / (np.sum(np.where(use, curvature, 0.0), axis=1) / n) ** 2)
 
 
 def _subspaces(
     jacobian: FloatArray, tolerance: float
-) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray]:
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Split parameter space by the singular values of a Jacobian with columns of length one."""
     length = np.linalg.norm(jacobian, axis=1)
     safe = np.where(length > 0.0, length, 1.0)
@@ -515,6 +546,7 @@ def _subspaces(
         np.swapaxes(null, 1, 2) @ null,
         counts.sum(axis=1),
         singular[:, 0] / smallest,
+        length,
     )
 
 
@@ -545,37 +577,39 @@ def normal_differences(mount: Mount, measurements: Measurements) -> FloatArray:
     return residual * measurements.sigma_rad[:, None]
 
 
-def predict(calibration: Calibration, count: npt.ArrayLike) -> Prediction:
-    """Return modelled normals at motor positions with the uncertainty that the parameters leave.
+def predict(calibration: Calibration, postures: Measurements) -> Prediction:
+    """Return modelled normals of postures with the uncertainty that the parameters leave.
 
     Parameters
     ----------
     calibration
         A fitted heliostat.
-    count : (posture, axis)
-        Motor positions.
+    postures
+        Motor positions with source and target. With a target at a finite distance the mirror's own place counts:
+        a place and a zero that were fitted together make up for each other, and what matters is their sum.
     """
-    counts = as_float_array("count", count, ("posture", 2))
-    jacobian = posture_jacobian(calibration.mount, counts, calibration.free)
+    jacobian = posture_jacobian(calibration.mount, postures, calibration.free)
     covariance = jacobian @ calibration.field.covariance[0] @ np.swapaxes(jacobian, -1, -2)
     p, k = stack_mounts([calibration.mount])
-    normal = _kernels.posture_batch(p, k, counts[None], 0.0)[0, :, 2:5]
+    normal = _kernels.posture_batch(p, k, np.ascontiguousarray(postures.count)[None], 0.0)[0, :, 2:5]
     return Prediction(
         normal_enu=normal,
+        error_rad=normal_errors_rad(calibration.mount, postures),
         cov_enu_rad2=covariance,
         sigma_rad=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)),
     )
 
 
-def posture_jacobian(mount: Mount, count: FloatArray, free: tuple[str, ...]) -> FloatArray:
-    """Return the derivative of mirror normals by parameters (posture, xyz, free)."""
-    rows = np.zeros((1, len(count), _kernels.N_ROW))
-    rows[..., 2] = rows[..., 6] = rows[..., 8] = 1.0
+def posture_jacobian(mount: Mount, postures: Measurements, free: tuple[str, ...]) -> FloatArray:
+    """Return the derivative of modelled minus wanted normals by parameters (posture, xyz, free)."""
+    row = postures.row.copy()
+    row[:, 8] = 1.0
     p, k = stack_mounts([mount])
     index = np.array([list(PARAMETERS).index(name) for name in free])
     scale = np.array([PARAMETERS[name] for name in free])
-    use = np.ones((1, len(count)), np.bool_)
-    jacobian: FloatArray = _kernels.jacobian_batch(p, k, np.ascontiguousarray(count)[None], rows, use, index, scale)[0]
+    use = np.ones((1, len(postures)), np.bool_)
+    count = np.ascontiguousarray(postures.count)
+    jacobian: FloatArray = _kernels.jacobian_batch(p, k, count[None], row[None], use, index, scale)[0]
     return jacobian
 
 

@@ -187,7 +187,7 @@ class Mount:
         object.__setattr__(self, "parameters", {name: values.get(name, 0.0) for name in _NAMES})
 
     def _nominal(self) -> dict[str, float]:
-        """Sides of the actuators' triangles as built."""
+        """Return the sides of the actuators' triangles as built."""
         sides: dict[str, float] = {}
         for i, actuator in enumerate(self.actuators, start=1):
             if actuator.kind == "linear":
@@ -201,11 +201,11 @@ class Mount:
         return dataclasses.replace(self, parameters={**self.parameters, **parameters})
 
     def parameter_vector(self) -> FloatArray:
-        """Parameters in the order of `PARAMETERS`."""
+        """Return the parameters in the order of `PARAMETERS`."""
         return np.array([self.parameters[name] for name in _NAMES])
 
     def constant_vector(self) -> FloatArray:
-        """What a calibration does not change, as the kernels read it."""
+        """Return what a calibration does not change, as the kernels read it."""
         first, second = self.actuators
         return np.concatenate(
             [

@@ -181,7 +181,9 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
     folder = directory / heliostat
     files = _record_files(folder)
     if not files:
-        raise RecordingError(f"{folder}: no calibration records; known heliostats: {', '.join(heliostat_ids(directory))}")
+        raise RecordingError(
+            f"{folder}: no calibration records; known heliostats: {', '.join(heliostat_ids(directory))}"
+        )
     tower_path = _one_file(directory, r"tower.measurements\.json$", "the tower's measurements")
     tower = _read_json(tower_path)
     origin = _key(tower, tower_path, "power_plant_properties", "coordinates")
@@ -248,7 +250,7 @@ def _record_files(folder: Path) -> dict[int, Path]:
 
 
 def _one_file(folder: Path, pattern: str, what: str) -> Path:
-    """The file below ``folder`` whose name ends as the pattern says."""
+    """Find the file below ``folder`` whose name ends as the pattern says."""
     paths = sorted(p for p in folder.rglob("*.json") if re.search(pattern, p.name) and "alibration" not in p.name)
     if not paths:
         raise RecordingError(f"{folder}: no file for {what} (name like {pattern!r})")
@@ -306,7 +308,8 @@ def _times(directory: Path, heliostat: str) -> dict[int, float]:
     table = _read_json(path)
     keys = [key for key in table if key.startswith(f"{heliostat}_")]
     return {
-        int(key.rsplit("_", 1)[1]): float(t) for key, t in zip(keys, unix_seconds([table[k] for k in keys]), strict=True)
+        int(key.rsplit("_", 1)[1]): float(t)
+        for key, t in zip(keys, unix_seconds([table[k] for k in keys]), strict=True)
     }
 
 

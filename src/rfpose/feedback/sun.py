@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 
 import numpy as np
 import numpy.typing as npt
@@ -100,7 +100,7 @@ def unix_seconds(times: Sequence[datetime | str] | npt.NDArray[np.datetime64]) -
             raise InvalidInputError(f"`times` must be ISO 8601 such as 2024-02-01T10:09:37Z, got {item!r}") from error
         if moment.tzinfo is None:
             raise InvalidInputError(f"`times` must say their time zone (a trailing Z for UTC), got {item!r}")
-        seconds.append(moment.astimezone(timezone.utc).timestamp())
+        seconds.append(moment.astimezone(UTC).timestamp())
     return np.array(seconds, np.float64)
 
 
@@ -119,7 +119,7 @@ def sun_position(unix_s: npt.ArrayLike, site: Site) -> Sun:
     .. [1] I. Reda, A. Andreas, Solar position algorithm for solar radiation applications, Solar Energy 76 (2004),
        as implemented by pvlib.
     """
-    from pvlib import spa  # pandas comes with it: only where it is needed
+    from pvlib import spa  # type: ignore[import-untyped]  # pandas comes with it: only where it is needed
 
     seconds = as_float_array("unix_s", np.atleast_1d(np.asarray(unix_s)), ("time",), finite=False)
     refraction_at_horizon_deg = 0.5667

@@ -1,0 +1,141 @@
+"""When a heliostat is no longer the one that was calibrated: single outliers, shifts, drift.
+
+Each measurement's error is told as what the two axes would have to be wrong by. A shift (re-homed, hit, a belt that
+jumped) is a change of level from one measurement on; the cheapest partition into runs finds them all. Drift is a slope
+(Theil and Sen's) between shifts that adds up to more than the limit.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import median_filter
+from scipy.stats import theilslopes
+
+from rfpose.checks import FloatArray, as_positive
+from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
+
+__all__ = ["Alarm", "alarms", "axis_errors_rad"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alarm:
+    """Something that a steady mount does not do.
+
+    Attributes
+    ----------
+    kind
+        ``"outlier"``: one measurement; ``"shift"``: from ``first`` on; ``"drift"``: from ``first`` to ``last``.
+    first, last
+        Measurements concerned, by index, in the order of time.
+    axis
+        1 or 2; of an outlier the one that is more wrong.
+    size_rad
+        Error, step, or total change of the axis angle [rad].
+    """
+
+    kind: Literal["outlier", "shift", "drift"]
+    first: int
+    last: int
+    axis: int
+    size_rad: float
+
+
+def axis_errors_rad(calibration: Calibration) -> FloatArray:
+    """Return what each axis would have to be wrong by to explain the errors (measurement, axis) [rad].
+
+    NaN where the measurement is unknown.
+    """
+    difference = normal_differences(calibration.mount, calibration.measurements)
+    jacobian = posture_jacobian(calibration.mount, calibration.measurements, ("axis_1_zero_rad", "axis_2_zero_rad"))
+    known = np.isfinite(difference).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+    out = np.full((len(difference), 2), np.nan)
+    out[known] = np.einsum("nax,nx->na", np.linalg.pinv(jacobian[known]), difference[known])
+    return out
+
+
+def alarms(
+    calibration: Calibration, *, outlier_rad: float = 5e-3, shift_rad: float = 2e-3, least_run: int = 3
+) -> tuple[Alarm, ...]:
+    """Return what happened to a heliostat in the course of its measurements.
+
+    Parameters
+    ----------
+    calibration
+        Fit to measurements in any order; they are taken in the order of time.
+    outlier_rad
+        Error of the normal from which on a measurement is an outlier [rad].
+    shift_rad
+        Step or total drift of an axis that is worth an alarm [rad]; it must also stand out of the scatter.
+    least_run
+        Fewest measurements on either side of a step.
+    """
+    as_positive("outlier_rad", outlier_rad)
+    as_positive("shift_rad", shift_rad)
+    order = np.argsort(calibration.measurements.unix_s, kind="stable")
+    error = axis_errors_rad(calibration)[order]
+    found = [
+        Alarm(kind="outlier", first=i, last=i, axis=1 + int(np.argmax(np.abs(error[i]))), size_rad=float(size))
+        for i, size in enumerate(calibration.error_rad[order])
+        if size > outlier_rad
+    ]
+    index = np.flatnonzero(np.isfinite(error).all(axis=1))
+    for axis in (0, 1):
+        series = error[index, axis]
+        cuts = _cuts(series, shift_rad, least_run)
+        edges = [0, *cuts, len(series)]
+        for before, at, after in zip(edges, edges[1:], edges[2:], strict=False):
+            step = float(np.median(series[at:after]) - np.median(series[before:at]))
+            if abs(step) > shift_rad:
+                last = int(index[after - 1])
+                found.append(Alarm(kind="shift", first=int(index[at]), last=last, axis=axis + 1, size_rad=step))
+        for a, b in itertools.pairwise(edges):
+            drift = _drift(series[a:b], shift_rad)
+            if drift is not None:
+                found.append(
+                    Alarm(kind="drift", first=int(index[a]), last=int(index[b - 1]), axis=axis + 1, size_rad=drift)
+                )
+    return tuple(sorted(found, key=lambda alarm: (alarm.first, alarm.kind)))
+
+
+def _cuts(series: npt.NDArray[np.float64], limit: float, least: int) -> list[int]:
+    """Places where the level steps: the cheapest partition into constant runs, found by dynamic programming.
+
+    A step costs what a run of ``least`` measurements saves that is wrong by the limit, or by three sigma of the
+    scatter from one measurement to the next. A running median of three takes single outliers out before.
+    """
+    n = len(series)
+    if n < 2 * least:
+        return []
+    x = median_filter(series, size=3, mode="nearest")
+    sigma = 1.4826 * float(np.median(np.abs(np.diff(series)))) / np.sqrt(2.0)
+    penalty = least * max(limit, 3.0 * sigma) ** 2
+    first, second = np.concatenate([[0.0], np.cumsum(x)]), np.concatenate([[0.0], np.cumsum(x**2)])
+    best, origin = np.full(n + 1, np.inf), np.zeros(n + 1, np.int64)
+    best[0] = -penalty
+    for stop in range(least, n + 1):
+        starts = np.arange(0, stop - least + 1)
+        length = stop - starts
+        cost = second[stop] - second[starts] - (first[stop] - first[starts]) ** 2 / length
+        total = best[starts] + cost + penalty
+        origin[stop] = starts[np.argmin(total)]
+        best[stop] = total.min()
+    cuts = []
+    stop = int(origin[n])
+    while stop > 0:
+        cuts.append(stop)
+        stop = int(origin[stop])
+    return cuts[::-1]
+
+
+def _drift(part: npt.NDArray[np.float64], limit: float) -> float | None:
+    """Total change along a run, if it is sure and beyond the limit."""
+    if len(part) < 10:
+        return None
+    slope, _, low, high = theilslopes(part, alpha=0.997)
+    total = float(slope) * (len(part) - 1)
+    return total if abs(total) > limit and low * high > 0.0 else None
