@@ -1,0 +1,262 @@
+"""Every way in which one mirror's measurements could be wrong, tested against its residuals.
+
+A hypothesis frees a part of the model: all observations of one transmitter, one transmitter at one receiver, the
+surveyed pivot, the mount, the common clock. Its statistic is the drop of chi² that this buys, exact for linear
+equations; without a fault it is chi²-distributed with as many degrees of freedom as the hypothesis has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import chdtri, chndtrinc, gammaincc, gammaln
+
+from rfpose.checks import FloatArray
+from rfpose.multilat.integrity import _kernels
+from rfpose.multilat.rigid import Knowledge, RigidPoses
+
+__all__ = ["PRIORS", "Problem", "Verdict", "judge", "log_probability", "noncentrality"]
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+PRIORS = ("pivot", "mount", "clocks")
+"""What a mirror may rest on besides its phases, in the order of the hypotheses after the transmitters."""
+
+_FLOOR = 1e-8
+"""Redundancy below which a fault counts as invisible."""
+_TIE_FLOOR = 1e-6
+"""Smallest variance of a receiver's delay, in units of the best observation's: stiff enough to be a shared clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Checked arrays of all mirrors, observations left out as weight zero.
+
+    Attributes
+    ----------
+    transmitter : (transmitter, xyz)
+    places : (mirror, receiver, xyz)
+    z, weight : (mirror, group, receiver, transmitter)
+        Ranges [m] and 1/σ².
+    bias_info : (mirror, group, transmitter)
+    classes : (group,)
+    known
+        Priors that all mirrors have, unless ``dropped``.
+    dropped : (mirror, prior)
+        Which of `PRIORS` is not used.
+    """
+
+    transmitter: FloatArray
+    places: FloatArray
+    z: FloatArray
+    weight: FloatArray
+    bias_info: FloatArray
+    classes: IntArray
+    known: Knowledge
+    dropped: BoolArray
+
+    @property
+    def has_prior(self) -> BoolArray:
+        """(mirror, prior) which of `PRIORS` is used."""
+        known = self.known
+        pivot = known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)
+        given = np.array([pivot, known.two_axis, np.isfinite(known.clock_sigma_m)])
+        return np.asarray(given & ~self.dropped)
+
+    def rows(self, index: npt.NDArray[np.int64]) -> Problem:
+        """Only some mirrors (the pivots of ``known`` stay those of all)."""
+        return Problem(
+            self.transmitter,
+            self.places[index],
+            self.z[index],
+            self.weight[index],
+            self.bias_info[index],
+            self.classes,
+            self.known,
+            self.dropped[index],
+        )
+
+    def prior_info(self, rot: FloatArray) -> FloatArray:
+        """(mirror, unknown, unknown) information of the priors, and of what only fixes an arbitrary common clock."""
+        n_mirror, _, n_receiver, _ = self.z.shape
+        n_class = int(self.classes.max()) + 1
+        has = self.has_prior
+        info = np.zeros((n_mirror, 6 + n_class * n_receiver, 6 + n_class * n_receiver))
+        info[:, range(3), range(3)] += (has[:, 0] / self.known.pivot_sigma_m**2)[:, None]
+        turn = np.stack([rot[:, 1, 0], -rot[:, 0, 0]], axis=-1) / self.known.roll_sigma_rad
+        info[:, 3:5, 3:5] += has[:, 1, None, None] * turn[:, :, None] * turn[:, None, :]
+        largest = np.maximum(self.weight.max(axis=(1, 2, 3)), 1e-300)
+        tie = (
+            has[:, 2] / np.maximum(self.known.clock_sigma_m**2, _TIE_FLOOR / largest)
+            if has[:, 2].any()
+            else 0 * largest
+        )
+        apart = np.eye(n_receiver) - 1.0 / n_receiver
+        for k in range(n_class):
+            clocks = slice(6 + k * n_receiver, 6 + (k + 1) * n_receiver)
+            info[:, clocks, clocks] += tie[:, None, None] * apart
+            calibrated = np.any(self.bias_info[:, self.classes == k] > 0.0, axis=(1, 2))
+            info[:, clocks.start, clocks.start] += np.where(calibrated, 0.0, largest)
+        return info
+
+    def dof(self) -> IntArray:
+        """(mirror,) observations and priors less unknowns."""
+        n_receiver = self.z.shape[2]
+        n_class = int(self.classes.max()) + 1
+        seen = self.weight > 0.0
+        free_error = seen.any(axis=2) & (self.bias_info == 0.0)
+        n = seen.sum(axis=(1, 2, 3)) - free_error.sum(axis=(1, 2)) - 6 - n_class * n_receiver
+        n += self.has_prior @ np.array([3, 1, n_class * (n_receiver - 1)])
+        for k in range(n_class):
+            n += ~np.any(self.bias_info[:, self.classes == k] > 0.0, axis=(1, 2))
+        return np.asarray(n)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Statistics of all hypotheses: transmitters first, then `PRIORS`.
+
+    Attributes
+    ----------
+    ok : (mirror,)
+        Whether the pose was determined at all; False: the rest is 0.
+    stat, dof : (mirror, hypothesis)
+        Drop of chi², and degrees of freedom; 0 = cannot be tested.
+    hidden : (mirror, hypothesis)
+        Part of the fault leaves no trace in the residuals, yet tilts the normal.
+    shift_rad : (mirror, hypothesis, 2)
+        What the fault, as estimated, did to the normal: rotation about the mirror's x and y axes.
+    spread_rad2 : (mirror, hypothesis, 2, 2)
+        What leaving it free adds to the covariance of that rotation.
+    cov_rad2 : (mirror, 2, 2)
+        Covariance of that rotation, nothing left free.
+    common, common_dof : (mirror, transmitter)
+        The same for an error common to all receivers.
+    link, link_dof : (mirror, receiver, transmitter)
+        The same for an error at one receiver.
+    """
+
+    ok: BoolArray
+    stat: FloatArray
+    dof: IntArray
+    hidden: BoolArray
+    shift_rad: FloatArray
+    spread_rad2: FloatArray
+    cov_rad2: FloatArray
+    common: FloatArray
+    common_dof: IntArray
+    link: FloatArray
+    link_dof: IntArray
+
+
+def judge(problem: Problem, poses: RigidPoses) -> Verdict:
+    """Test every hypothesis at the least-squares poses."""
+    n_mirror, _, n_receiver, n_transmitter = problem.z.shape
+    n_hypothesis = n_transmitter + len(PRIORS)
+    rot = np.ascontiguousarray(poses.rot_enu_from_mirror)
+    prior_info = problem.prior_info(rot)
+    n = prior_info.shape[1]
+    data_info, cov = np.zeros((2, n_mirror, n, n))
+    gradient = np.zeros((n_mirror, n))
+    stat = np.zeros((n_mirror, n_hypothesis))
+    dof = np.zeros((n_mirror, n_hypothesis), np.int64)
+    hidden = np.zeros((n_mirror, n_hypothesis), np.bool_)
+    shift = np.zeros((n_mirror, n_hypothesis, 2))
+    spread = np.zeros((n_mirror, n_hypothesis, 2, 2))
+    common, common_dof = np.zeros((n_mirror, n_transmitter)), np.zeros((n_mirror, n_transmitter), np.int64)
+    link = np.zeros((n_mirror, n_receiver, n_transmitter))
+    link_dof = np.zeros((n_mirror, n_receiver, n_transmitter), np.int64)
+    ok = np.zeros(n_mirror, np.bool_)
+    _kernels.judge_many(
+        problem.transmitter, problem.places, problem.z, problem.weight, problem.bias_info, problem.classes, prior_info,
+        np.ascontiguousarray(poses.pivot_enu_m), rot, np.ascontiguousarray(poses.clock_m), _FLOOR, data_info, gradient,
+        cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,
+    )  # fmt: skip
+    axes = rot[:, :, :2]
+    cov_tilt = np.einsum("mac,mab,mbd->mcd", axes, cov[:, 3:6, 3:6], axes)
+    for k, (used, fault) in enumerate(zip(problem.has_prior.T, _prior_faults(problem, rot), strict=True)):
+        rows = np.flatnonzero(used & ok)
+        if rows.size:
+            h = n_transmitter + k
+            stat[rows, h], dof[rows, h], hidden[rows, h], shift[rows, h], spread[rows, h] = _free_prior(
+                data_info[rows], gradient[rows], cov[rows], axes[rows], cov_tilt[rows], fault[rows]
+            )
+    for array in (stat, dof, hidden, shift, spread, common, common_dof, link, link_dof):
+        array[~ok] = 0
+    return Verdict(
+        ok=ok, stat=stat, dof=dof, hidden=hidden, shift_rad=shift, spread_rad2=spread, cov_rad2=cov_tilt,
+        common=common, common_dof=common_dof, link=link, link_dof=link_dof,
+    )  # fmt: skip
+
+
+def _prior_faults(problem: Problem, rot: FloatArray) -> list[FloatArray]:
+    """Unknowns (mirror, unknown, fault) that each of `PRIORS` would leave free."""
+    n_mirror, _, n_receiver, _ = problem.z.shape
+    n_class = int(problem.classes.max()) + 1
+    eye = np.eye(6 + n_class * n_receiver)
+    mount = np.zeros((n_mirror, len(eye), 1))
+    mount[:, 3, 0], mount[:, 4, 0] = rot[:, 1, 0], -rot[:, 0, 0]
+    mount /= np.maximum(np.linalg.norm(mount, axis=1, keepdims=True), 1e-300)
+    delays = [6 + k * n_receiver + r for k in range(n_class) for r in range(1, n_receiver)]
+    return [
+        np.broadcast_to(eye[:, :3], (n_mirror, len(eye), 3)),
+        mount,
+        np.broadcast_to(eye[:, delays], (n_mirror, len(eye), len(delays))),
+    ]
+
+
+def _free_prior(
+    data_info: FloatArray,
+    gradient: FloatArray,
+    cov: FloatArray,
+    axes: FloatArray,
+    cov_tilt: FloatArray,
+    fault: FloatArray,
+) -> tuple[FloatArray, IntArray, BoolArray, FloatArray, FloatArray]:
+    """Drop of chi² when the unknowns ``fault`` are freed of their prior, for each mirror."""
+    through = data_info @ fault
+    answer = cov @ through
+    matrix = np.swapaxes(fault, 1, 2) @ through - np.swapaxes(through, 1, 2) @ answer
+    right = np.einsum("mnf,mn->mf", fault, gradient)
+    tilt = np.swapaxes(axes, 1, 2) @ (answer - fault)[:, 3:6]
+    # each unknown in units of what the data alone would say of it
+    unit = np.sqrt(np.maximum(np.einsum("mnf,mnf->mf", fault, through), 1e-300))
+    matrix = matrix / (unit[:, :, None] * unit[:, None, :])
+    right, tilt = right / unit, tilt / unit[:, None, :]
+    blind = 1e-5 * np.sqrt(np.trace(cov_tilt, axis1=1, axis2=2))
+    n = len(fault)
+    stat, dof, hidden = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    shift, spread = np.zeros((n, 2)), np.zeros((n, 2, 2))
+    for m in range(n):
+        stat[m], dof[m], hidden[m] = _kernels.explain(
+            matrix[m], right[m], tilt[m], _FLOOR, blind[m], shift[m], spread[m]
+        )
+    return stat, dof, hidden, shift, spread
+
+
+def log_probability(stat: FloatArray, dof: IntArray) -> FloatArray:
+    """Logarithm of the probability that chi² of ``dof`` exceeds ``stat``; 0 without degrees of freedom."""
+    half, x = np.maximum(dof, 1) / 2.0, np.maximum(stat, 0.0) / 2.0
+    far = x > 300.0 + half
+    with np.errstate(divide="ignore"):
+        near = np.log(gammaincc(half, np.where(far, 0.0, x)))
+        # first terms of the asymptotic series of Γ(a, x)
+        tail = (half - 1.0) * np.log(x) - x - gammaln(half) + np.log1p(np.where(far, (half - 1.0) / x, 0.0))
+    return np.asarray(np.where(dof > 0, np.where(far, tail, near), 0.0))
+
+
+def limit(probability: float | FloatArray, dof: IntArray) -> FloatArray:
+    """Value that chi² of ``dof`` exceeds with ``probability``."""
+    return np.asarray(np.where(dof > 0, chdtri(np.maximum(dof, 1), probability), np.inf))
+
+
+def noncentrality(threshold: FloatArray, dof: IntArray, missed: float) -> FloatArray:
+    """Noncentrality at which a chi² of ``dof`` stays below ``threshold`` with probability ``missed``."""
+    out = np.full(dof.shape, np.inf)
+    for d in np.unique(dof[dof > 0]):
+        at = dof == d
+        out[at] = chndtrinc(threshold[at][0], float(d), missed)
+    return out
