@@ -128,6 +128,8 @@ class Mirror(_Record):
     """How well the delays between a mirror's receivers are known; without it they are unknown in every frame."""
     pivot_sigma_m: Positive | None = None
     """How well pivots are surveyed; without it they are not used."""
+    carrier_phase: bool = True
+    """Whether receivers on one oscillator also compare the carriers' own phases."""
     mount: Literal["free", "azimuth_elevation"] = "free"
     """Whether orientation is held to a two-axis mount, whose mirror keeps its x axis horizontal."""
 
@@ -143,6 +145,7 @@ class Heliostat(_Record):
     oscillator: Literal["shared", "separate"] = "shared"
     receiver_delay_sigma_s: NonNegative | None = None
     pivot_sigma_m: Positive | None = None
+    carrier_phase: bool = True
     mount: Literal["free", "azimuth_elevation"] = "free"
     normal_enu: Point | None = None
     """Posture for simulation; without it the mirror reflects the simulated sun onto the aim point."""

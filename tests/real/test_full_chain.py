@@ -10,6 +10,9 @@ import pytest
 from click.testing import CliRunner
 
 from rfpose.cli._app import app
+from rfpose.pipeline.evaluate import evaluate, read_truth
+from rfpose.pipeline.process import process
+from rfpose.pipeline.result_file import read_result
 
 pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
 
@@ -47,7 +50,8 @@ def test_scenario_says_what_the_description_says() -> None:
 @pytest.mark.parametrize("estimator", ["hilbert", "correlator"])
 def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str) -> None:
     result = tmp_path / "result.h5"
-    arguments = [str(SOURCE / "drf"), "--scenario", str(SITE), "-o", str(result), "--estimator", estimator, "--json"]
+    arguments = [str(SOURCE / "drf"), "--scenario", str(SITE), "-o", str(result), "--estimator", estimator]
+    arguments += ["--pose", "independent", "--json"]
     processed = CliRunner().invoke(app, ["process", *arguments])
     assert processed.exit_code == 0, processed.stderr
     assert json.loads(processed.stdout)["poses"] == {"solved": 1, "failed": 0, "reasons": {}}
@@ -62,3 +66,26 @@ def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str) ->
     # the estimators' own noise (the Hilbert filters lose a few per cent of the samples) moves it a little
     assert found["normal_error_mrad"]["rms"] == pytest.approx(1.48, abs=0.05)
     assert found["bound_source"] == "result"
+
+
+@pytest.mark.parametrize(
+    ("mirror", "expected_mrad", "tolerance_mrad"),
+    [
+        # recomputed independently on this recording; the carrier between receivers is asked to reach 0.02
+        ("carrier_phase = false", 1.30, 0.05),
+        ("carrier_phase = false\nreceiver_delay_sigma_s = 0.0", 0.16, 0.03),
+        ("receiver_delay_sigma_s = 0.0", 0.0, 0.02),
+        ("", 0.0, 0.02),
+    ],
+    ids=["three clocks", "one clock", "one clock and carrier", "three clocks and carrier"],
+)
+def test_rigid_normal_from_digital_rf(tmp_path: Path, mirror: str, expected_mrad: float, tolerance_mrad: float) -> None:
+    site = tmp_path / "site.toml"
+    text = SITE.read_text()
+    assert "[[heliostat]]\n" in text
+    site.write_text(text.replace("[[heliostat]]\n", f"[[heliostat]]\n{mirror}\n"))
+    result = tmp_path / "result.h5"
+    process(SOURCE / "drf", result, scenario_path=site, estimator="correlator", pose="rigid")
+    found = evaluate(read_result(result), read_truth(SOURCE / "truth.json", read_result(result).scenario))
+    assert found.normal_error_mrad.rms == pytest.approx(expected_mrad, abs=tolerance_mrad)
+    assert found.normal_error_mrad.rms < 4 * found.sigma_mrad

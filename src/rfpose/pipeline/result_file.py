@@ -108,6 +108,10 @@ class PoseTable:
         Mean position of the located receivers, site ENU [m].
     n_receiver : (frame, heliostat)
         Receivers used.
+    n_wavelength : (frame, heliostat)
+        Wavelengths that pose ``rigid`` rests on: tones, and the carrier, whose whole wavelengths were resolved.
+    integer_risk : (frame, heliostat)
+        Largest probability, beforehand, that one of them has a wrong whole wavelength. NaN for pose ``independent``.
     status : (frame, heliostat)
         `rfpose.multilat.PoseStatus`.
     """
@@ -119,6 +123,8 @@ class PoseTable:
     elevation_rad: FloatArray
     centre_enu_m: FloatArray
     n_receiver: npt.NDArray[np.int16]
+    n_wavelength: npt.NDArray[np.int16]
+    integer_risk: FloatArray
     status: StatusArray
 
 
@@ -219,6 +225,8 @@ KEYS: Mapping[str, Key] = {
     "poses/elevation_rad": Key(_FH, "f8", "rad", "elevation of the normal"),
     "poses/centre_enu_m": Key((*_FH, 3), "f8", "m", "mean position of the located receivers"),
     "poses/n_receiver": Key(_FH, "i2", "1", "receivers used"),
+    "poses/n_wavelength": Key(_FH, "i2", "1", "wavelengths (tones, carrier) with resolved integers; 0: independent"),
+    "poses/integer_risk": Key(_FH, "f8", "1", "largest probability of a wrong integer beforehand"),
     "poses/status": Key(_FH, "i1", "code", "why a pose is missing, 0 solved"),
     "truth/frame_start_index": Key(("truth_frame",), "i8", "sample", "frames of the truth"),
     "truth/normal_enu": Key(("truth_frame", "heliostat", 3), "f8", "1", "true mirror normal"),

@@ -46,6 +46,11 @@ class _Group:
     pivot_enu_m: FloatArray
     kind: Heliostat
 
+    @property
+    def uses_carrier(self) -> bool:
+        """Whether carriers can be compared between the receivers: only on one oscillator do their phases cancel."""
+        return self.kind.oscillator == "shared" and self.kind.carrier_phase
+
     def knowledge(self, scenario: Scenario, n_frame: int) -> Knowledge:
         """Return what the scenario knows of these mirrors, one row a frame and heliostat."""
         kind = self.kind
@@ -63,7 +68,14 @@ def _groups(scenario: Scenario) -> Iterator[_Group]:
     """Sort heliostats by number of receivers and by what is known of them."""
     kinds: dict[tuple[object, ...], list[int]] = {}
     for i, h in enumerate(scenario.heliostat):
-        key = (len(h.receiver_ids), h.oscillator, h.receiver_delay_sigma_s, h.pivot_sigma_m, h.mount)
+        key = (
+            len(h.receiver_ids),
+            h.oscillator,
+            h.receiver_delay_sigma_s,
+            h.pivot_sigma_m,
+            h.mount,
+            h.carrier_phase,
+        )
         kinds.setdefault(key, []).append(i)
     for members in kinds.values():
         helio = [scenario.heliostat[i] for i in members]
@@ -100,7 +112,7 @@ def solve_rigid_poses(
         The site.
     """
     table = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
-    for name in ("normal_enu", "cov_enu", "sigma_rad", "azimuth_rad", "elevation_rad", "centre_enu_m"):
+    for name in ("normal_enu", "cov_enu", "sigma_rad", "azimuth_rad", "elevation_rad", "centre_enu_m", "integer_risk"):
         table[name][:] = np.nan
     n_frame = len(tones.frame_start_index)
     for group in _groups(scenario):
@@ -133,6 +145,8 @@ def solve_rigid_poses(
             "elevation_rad": elevation,
             "centre_enu_m": centre,
             "n_receiver": np.where(np.isfinite(normal[:, 0]), group.rows.shape[1], 0),
+            "n_wavelength": solution.fixed.sum(axis=1),
+            "integer_risk": np.where(solution.fixed, solution.wrong_risk, 0.0).max(axis=1),
             "status": status,
         }
         for name, values in found.items():
@@ -178,7 +192,7 @@ def _observations(
                 clock_class=k,
             )
         )
-    if group.kind.oscillator == "shared":
+    if group.uses_carrier:
         carrier_m = scenario.radio.propagation_speed_mps / (scenario.radio.centre_frequency_hz + scenario.carrier_hz)
         to_m_each = carrier_m / (2.0 * np.pi)
         seen = np.isfinite(tones.phase_rad[..., 0])
@@ -237,7 +251,7 @@ def rigid_normal_bound(
             to_m = wavelength / (2.0 * np.pi)
             sigma.append(to_m * tone_sigma[..., q][:, group.rows].reshape(n, *group.rows.shape[1:], -1))
             common.append(to_m * np.repeat(calibration_sigma[..., q], len(group.column), axis=0))
-        if group.kind.oscillator == "shared":
+        if group.uses_carrier:
             carrier_m = scenario.radio.propagation_speed_mps / (
                 scenario.radio.centre_frequency_hz + scenario.carrier_hz
             )

@@ -113,5 +113,12 @@ def _fix_table(fixes: Fixes, n_frame: int, n_receiver: int) -> FixTable:
 
 
 def _pose_table(poses: Poses) -> PoseTable:
-    names = [name for name in PoseTable.__dataclass_fields__ if name != "centre_enu_m"]
-    return PoseTable(**{name: getattr(poses.normals, name) for name in names}, centre_enu_m=poses.centre_enu_m)
+    own = {"centre_enu_m", "n_wavelength", "integer_risk"}
+    names = [name for name in PoseTable.__dataclass_fields__ if name not in own]
+    shape = poses.normals.sigma_rad.shape
+    return PoseTable(
+        **{name: getattr(poses.normals, name) for name in names},
+        centre_enu_m=poses.centre_enu_m,
+        n_wavelength=np.zeros(shape, np.int16),
+        integer_risk=np.full(shape, np.nan),
+    )

@@ -16,9 +16,12 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, solve_rigid
 
-__all__ = ["Observation", "RigidSolution", "align_points", "solve_ladder"]
+__all__ = ["Observation", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
 
 BoolArray = npt.NDArray[np.bool_]
+
+_DELAY_REACH_M = 3.0
+"""Unknown delays between a mirror's receivers are searched up to this, 10 ns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -205,21 +208,19 @@ def _resolve(
     wavelength = observation.wavelength_m
     left = observation.range_m - distance
     calibrated = np.isfinite(observation.transmitter_sigma_m).all()
+    # what clocks add is found from the ranges themselves: the mean over transmitters says nothing about integers
+    centred = slope - slope.mean(axis=2, keepdims=True)
+    offset_free = True
     if calibrated:
-        # each range against the pose; the clock is the mean over transmitters, found on the circle
-        left = left - _circular_mean(left, wavelength, axis=2)
-        slope = slope - slope.mean(axis=2, keepdims=True)
+        slope = centred
         noise = observation.sigma_m**2 + observation.transmitter_sigma_m[:, None] ** 2
     else:
         # only differences between receivers mean anything
         left = left - left[:, :1]
-        slope = slope - slope[:, :1]
         noise = observation.sigma_m**2 + observation.sigma_m[:, :1] ** 2
-        if not np.isfinite(known.clock_sigma_m):
-            left = left - _circular_mean(left, wavelength, axis=2)
-            slope = slope - slope.mean(axis=2, keepdims=True)
-        else:
-            noise = noise + 2.0 * known.clock_sigma_m**2
+        offset_free = not np.isfinite(known.clock_sigma_m)
+        slope = centred - centred[:, :1] if offset_free else slope - slope[:, :1]
+        noise = noise if offset_free else noise + 2.0 * known.clock_sigma_m**2
     if usable:
         assert poses is not None
         predicted = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
@@ -227,32 +228,62 @@ def _resolve(
         assert start_sigma is not None
         predicted = np.broadcast_to((start_sigma**2)[:, None, None], left.shape)
     sigma = np.sqrt(predicted + noise)
+    offset_risk = np.zeros(left.shape[:2])
+    if offset_free:
+        offset, offset_risk = common_offset(left, wavelength, sigma)
+        left = left - offset
     turns = np.rint(left / wavelength)
     with np.errstate(invalid="ignore"):
         wrong = erfc(0.5 * wavelength / (np.sqrt(2.0) * sigma))
-    risk = np.nansum(np.where(np.isfinite(left), wrong, 0.0), axis=(1, 2))
+    wrong = np.where(np.isfinite(wrong), wrong, 1.0)  # a mirror without a pose so far predicts nothing
+    risk = np.where(np.isfinite(left), wrong, 0.0).sum(axis=(1, 2)) + offset_risk[:, 0 if calibrated else 1 :].sum(
+        axis=1
+    )
     risk = np.where(np.isfinite(left).any(axis=(1, 2)), np.minimum(risk, 1.0), 1.0)
     return observation.range_m - turns * wavelength, risk
 
 
-def _circular_mean(left: FloatArray, wavelength: FloatArray, axis: int) -> FloatArray:
-    """Return the common offset of ranges known up to whole wavelengths, as a range near zero; per receiver.
+def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the common offset of ranges known up to whole wavelengths, per receiver, and the risk of a wrong one.
 
-    With unequal wavelengths (carriers) the offset is the one that fits all best on the grid of the longest.
+    With one wavelength the offset is near zero; any multiple of it does as well. With unequal wavelengths (carriers)
+    it is the one within ±`_DELAY_REACH_M` that fits best, and the runner-up tells how safely.
+
+    Parameters
+    ----------
+    left, sigma : (mirror, receiver, transmitter)
+        Ranges less their prediction, NaN = not received; what they may scatter [m].
+    wavelength : (transmitter,)
+        [m].
+
+    Returns
+    -------
+    offset_m : (mirror, receiver, 1)
+    risk : (mirror, receiver)
     """
-    weight = np.isfinite(left)
+    seen = np.isfinite(left)
+    count = np.maximum(seen.sum(axis=2, keepdims=True), 1)
     if np.ptp(wavelength) == 0.0:
-        phasor = np.where(weight, np.exp(2j * np.pi * np.nan_to_num(left) / wavelength), 0.0)
-        mean = np.angle(phasor.sum(axis=axis, keepdims=True)) / (2 * np.pi) * wavelength[0]
-        return np.asarray(mean)
-    reach = float(np.max(wavelength))
-    best = np.zeros(left.sum(axis=axis, keepdims=True).shape)
-    best_score = np.full(best.shape, -np.inf)
-    for offset in np.linspace(-0.5, 0.5, 33)[:-1] * reach:
-        turn = np.where(weight, np.cos(2 * np.pi * (np.nan_to_num(left) - offset) / wavelength), 0.0)
-        score = turn.sum(axis=axis, keepdims=True)
-        better = score > best_score
-        best, best_score = np.where(better, offset, best), np.where(better, score, best_score)
-    fine = left - best
-    fine = fine - np.rint(fine / wavelength) * wavelength
-    return np.asarray(best + np.nanmean(fine, axis=axis, keepdims=True))
+        phasor = np.where(seen, np.exp(2j * np.pi * np.nan_to_num(left) / wavelength), 0.0)
+        mean = np.angle(phasor.sum(axis=2, keepdims=True)) / (2 * np.pi) * wavelength[0]
+        return np.asarray(mean), np.zeros(left.shape[:2])
+    steps = int(np.ceil(4.0 * _DELAY_REACH_M / float(np.min(wavelength)))) + 1
+    offsets, scores = [], []
+    for begin in np.linspace(-_DELAY_REACH_M, _DELAY_REACH_M, steps):
+        offset = np.full(count.shape, begin)
+        for _ in range(4):
+            wrapped = np.where(seen, left - offset, 0.0)
+            wrapped = wrapped - np.rint(wrapped / wavelength) * wavelength
+            offset = offset + wrapped.sum(axis=2, keepdims=True) / count
+        offsets.append(offset)
+        with np.errstate(invalid="ignore"):
+            scores.append(np.where(seen, (wrapped / sigma) ** 2, 0.0).sum(axis=2))
+    all_offsets, score = np.stack(offsets), np.nan_to_num(np.stack(scores), nan=np.inf)
+    best = np.argmin(score, axis=0)[None]
+    chosen = np.take_along_axis(all_offsets, best[..., None], axis=0)[0]
+    lowest = np.take_along_axis(score, best, axis=0)
+    # several beginnings end at the same offset; the runner-up is the best of the others
+    apart = np.abs(all_offsets - chosen)[..., 0] > 0.25 * float(np.min(wavelength))
+    with np.errstate(invalid="ignore"):
+        odds = np.where(apart, np.exp(-0.5 * np.minimum(score - lowest, 1400.0)), 0.0).sum(axis=0)
+    return chosen, np.nan_to_num(np.minimum(odds, 1.0), nan=1.0)

@@ -214,7 +214,7 @@ def solve_rigid(
         clock_m=clock,
         cov=cov,
         chi2=chi2,
-        dof=_dof(weight, bias_info, known, n_class, n_receiver),
+        dof=_dof(weight, bias_info, known, classes, n_class),
         n_iteration=n_iteration,
         status=status,
     )
@@ -327,6 +327,12 @@ def _clock_ties(
     for k in range(n_class):
         known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
         own[:, k, 0] = np.where(known, 0.0, largest)
+        # a clock that nothing observes is held as well; it takes part in nothing
+        seen = np.any(weight[:, classes == k] > 0.0, axis=(1, 3))
+        if np.isfinite(clock_sigma_m):
+            own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
+        else:
+            own[:, k] = np.where(seen, own[:, k], largest)
     tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
     if np.isfinite(clock_sigma_m):
         tie[:] = largest / (n_receiver * max(float(clock_sigma_m) ** 2 * largest, 1e-8))
@@ -355,12 +361,18 @@ def _start_clock(
     return out
 
 
-def _dof(weight: FloatArray, bias_info: FloatArray, known: Knowledge, n_class: int, n_receiver: int) -> FloatArray:
-    seen = weight > 0
-    n = seen.sum(axis=(1, 2, 3)).astype(np.float64)
-    free_bias = np.any(seen, axis=2) & (bias_info == 0.0)
-    n -= free_bias.sum(axis=(1, 2))
-    shared = np.isfinite(known.clock_sigma_m)
-    n -= 6 + (n_class * n_receiver if not shared else n_class)
-    n += 3 * (known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)) + known.two_axis
+def _dof(
+    weight: FloatArray, bias_info: FloatArray, known: Knowledge, classes: npt.NDArray[np.int64], n_class: int
+) -> FloatArray:
+    """Measurements and priors less unknowns (mirror,)."""
+    seen = weight > 0.0
+    n = seen.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0
+    n -= (np.any(seen, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
+    for k in range(n_class):
+        clocks = np.any(seen[:, classes == k], axis=(1, 3)).sum(axis=1)
+        free = np.minimum(clocks, 1) if np.isfinite(known.clock_sigma_m) else clocks
+        # without calibration a common clock is the transmitters' as well, and counted with them
+        calibrated = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
+        n -= np.where(calibrated, free, np.maximum(free - 1, 0))
+    n += 3.0 * (known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)) + float(known.two_axis)
     return np.asarray(n)
