@@ -570,8 +570,8 @@ def normal_differences(mount: Mount, measurements: Measurements) -> FloatArray:
     residual: FloatArray = _kernels.residuals_batch(
         mount.parameter_vector()[None],
         mount.constant_vector()[None],
-        np.ascontiguousarray(measurements.count)[None],
-        np.ascontiguousarray(measurements.row)[None],
+        measurements.count.copy()[None],  # kernels are compiled for arrays that can be written
+        measurements.row.copy()[None],
         np.ones((1, len(measurements)), np.bool_),
     )[0]
     return residual * measurements.sigma_rad[:, None]
@@ -591,7 +591,7 @@ def predict(calibration: Calibration, postures: Measurements) -> Prediction:
     jacobian = posture_jacobian(calibration.mount, postures, calibration.free)
     covariance = jacobian @ calibration.field.covariance[0] @ np.swapaxes(jacobian, -1, -2)
     p, k = stack_mounts([calibration.mount])
-    normal = _kernels.posture_batch(p, k, np.ascontiguousarray(postures.count)[None], 0.0)[0, :, 2:5]
+    normal = _kernels.posture_batch(p, k, postures.count.copy()[None], 0.0)[0, :, 2:5]
     return Prediction(
         normal_enu=normal,
         error_rad=normal_errors_rad(calibration.mount, postures),
@@ -608,7 +608,7 @@ def posture_jacobian(mount: Mount, postures: Measurements, free: tuple[str, ...]
     index = np.array([list(PARAMETERS).index(name) for name in free])
     scale = np.array([PARAMETERS[name] for name in free])
     use = np.ones((1, len(postures)), np.bool_)
-    count = np.ascontiguousarray(postures.count)
+    count = postures.count.copy()
     jacobian: FloatArray = _kernels.jacobian_batch(p, k, count[None], row[None], use, index, scale)[0]
     return jacobian
 

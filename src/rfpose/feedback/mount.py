@@ -41,8 +41,6 @@ __all__ = [
     "command",
     "mount_frame_from_axis",
     "posture",
-    "reflect",
-    "target_offset_m",
 ]
 
 PARAMETERS: dict[str, float] = {
@@ -305,7 +303,7 @@ def posture(mount: Mount, count: npt.ArrayLike, *, receiver_plane: bool = False)
     out = _kernels.posture_batch(
         mount.parameter_vector()[None],
         mount.constant_vector()[None],
-        np.ascontiguousarray(counts.reshape(1, -1, 2)),
+        counts.reshape(1, -1, 2).copy(),  # kernels are compiled for arrays that can be written
         1.0 if receiver_plane else 0.0,
     ).reshape(*counts.shape[:-1], 8)
     return Posture(axis_rad=out[..., :2], normal_enu=out[..., 2:5], centre_enu_m=out[..., 5:])
@@ -361,59 +359,6 @@ def command(
         np.ascontiguousarray(rows.reshape(1, -1, _kernels.N_ROW)),
     )
     return Commands(count=count.reshape(*shape, 2), status=status.reshape(shape))
-
-
-def reflect(normal_enu: npt.ArrayLike, sun_enu: npt.ArrayLike) -> FloatArray:
-    """Return the direction into which a mirror sends the sun.
-
-    Parameters
-    ----------
-    normal_enu, sun_enu : (..., xyz)
-        Mirror normal and direction towards the sun.
-
-    Returns
-    -------
-    (..., xyz)
-        Unit vectors; NaN where the sun is behind the mirror.
-    """
-    normal, sun = geometry.unit(normal_enu), geometry.unit(sun_enu)
-    cosine = np.sum(normal * sun, axis=-1, keepdims=True)
-    return np.asarray(np.where(cosine > 0.0, 2.0 * cosine * normal - sun, np.nan))
-
-
-def target_offset_m(
-    centre_enu_m: npt.ArrayLike,
-    beam_enu: npt.ArrayLike,
-    *,
-    target_enu_m: npt.ArrayLike,
-    target_normal_enu: npt.ArrayLike,
-) -> FloatArray:
-    """Return where beams meet a plane target, from its centre [m].
-
-    Parameters
-    ----------
-    centre_enu_m, beam_enu : (..., xyz)
-        Mirror centres [m] and directions of the beams.
-    target_enu_m : (xyz)
-        Centre of the target.
-    target_normal_enu : (xyz)
-        Outward normal of the target's plane, tilted or not; Malan's (4.22) is the direction towards the heliostat.
-
-    Returns
-    -------
-    (..., 2)
-        Right and up, as seen looking at the target from in front [m]; NaN where the beam misses the plane's front.
-    """
-    centre = as_float_array("centre_enu_m", centre_enu_m, ("...", 3), finite=False)
-    beam = geometry.unit(beam_enu)
-    target = as_float_array("target_enu_m", target_enu_m, (3,))
-    right, up, normal = np.moveaxis(geometry.rot_enu_from_mirror(target_normal_enu), -1, 0)
-    against = -np.sum(beam * normal, axis=-1)
-    height = np.sum((centre - target) * normal, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = np.where((against > 1e-9) & (height > 0.0), height / against, np.nan)
-    hit = centre + distance[..., None] * beam - target
-    return np.stack([np.sum(hit * right, axis=-1), np.sum(hit * up, axis=-1)], axis=-1)
 
 
 def stack_mounts(mounts: Sequence[Mount]) -> tuple[FloatArray, FloatArray]:

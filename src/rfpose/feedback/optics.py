@@ -1,0 +1,88 @@
+"""What a mirror does with the sun: where the beam goes, where it meets a target, how much of it is caught."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, as_float_array, as_positive
+
+__all__ = ["intercept_ratio", "reflect", "target_offset_m"]
+
+
+def reflect(normal_enu: npt.ArrayLike, sun_enu: npt.ArrayLike) -> FloatArray:
+    """Return the direction into which a mirror sends the sun.
+
+    Parameters
+    ----------
+    normal_enu, sun_enu : (..., xyz)
+        Mirror normal and direction towards the sun.
+
+    Returns
+    -------
+    (..., xyz)
+        Unit vectors; NaN where the sun is behind the mirror.
+    """
+    normal, sun = geometry.unit(normal_enu), geometry.unit(sun_enu)
+    cosine = np.sum(normal * sun, axis=-1, keepdims=True)
+    return np.asarray(np.where(cosine > 0.0, 2.0 * cosine * normal - sun, np.nan))
+
+
+def target_offset_m(
+    centre_enu_m: npt.ArrayLike,
+    beam_enu: npt.ArrayLike,
+    *,
+    target_enu_m: npt.ArrayLike,
+    target_normal_enu: npt.ArrayLike,
+) -> FloatArray:
+    """Return where beams meet a plane target, from its centre [m].
+
+    Parameters
+    ----------
+    centre_enu_m, beam_enu : (..., xyz)
+        Mirror centres [m] and directions of the beams.
+    target_enu_m : (xyz)
+        Centre of the target.
+    target_normal_enu : (xyz)
+        Outward normal of the target's plane, tilted or not; Malan's (4.22) is the direction towards the heliostat.
+
+    Returns
+    -------
+    (..., 2)
+        Right and up, as seen looking at the target from in front [m]; NaN where the beam misses the plane's front.
+    """
+    centre = as_float_array("centre_enu_m", centre_enu_m, ("...", 3), finite=False)
+    beam = geometry.unit(beam_enu)
+    target = as_float_array("target_enu_m", target_enu_m, (3,))
+    right, up, normal = np.moveaxis(geometry.rot_enu_from_mirror(target_normal_enu), -1, 0)
+    against = -np.sum(beam * normal, axis=-1)
+    height = np.sum((centre - target) * normal, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where((against > 1e-9) & (height > 0.0), height / against, np.nan)
+    hit = centre + distance[..., None] * beam - target
+    return np.stack([np.sum(hit * right, axis=-1), np.sum(hit * up, axis=-1)], axis=-1)
+
+
+def intercept_ratio(
+    normal_error_rad: npt.ArrayLike, *, sun_rad: float = 9.3e-3, slope_error_rad: float = 1.5e-3
+) -> FloatArray:
+    """Return the part of a heliostat's round image that an aperture of the image's size still catches [1]_.
+
+    Parameters
+    ----------
+    normal_error_rad : (...)
+        Error of the mirror normal [rad].
+    sun_rad
+        Angle subtended by the sun [rad].
+    slope_error_rad
+        Mean slope error of the mirror [rad].
+
+    References
+    ----------
+    .. [1] Malan, A heliostat field control system, (3.3): overlap of two equal discs.
+    """
+    error = np.abs(as_float_array("normal_error_rad", normal_error_rad, ("...",)))
+    radius = 0.5 * as_positive("sun_rad", sun_rad) + slope_error_rad
+    half = np.minimum(error / (2.0 * radius), 1.0)
+    return np.asarray(2.0 / np.pi * (np.arccos(half) - half * np.sqrt(1.0 - half**2)))
