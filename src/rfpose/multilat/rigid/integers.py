@@ -177,9 +177,28 @@ def solve_ladder(
             else _or(poses.rot_enu_from_mirror, start_rot_enu_from_mirror),
             knowledge=knowledge,
         )
+        if poses is not None:
+            # what made a solved mirror unsolvable is not used for it
+            worse = (poses.status == RigidStatus.OK) & (solution.status != RigidStatus.OK)
+            fixed[worse, k] = False
+            resolved[k][worse] = np.nan
+            solution = _merge(solution, poses, worse)
         poses = solution
     assert poses is not None
     return RigidSolution(poses=poses, fixed=fixed, wrong_risk=risk)
+
+
+def _merge(new: RigidPoses, old: RigidPoses, keep_old: BoolArray) -> RigidPoses:
+    """Take each mirror's row from the old poses where told; clock classes that the old ones lack are NaN."""
+    arrays = {}
+    for name in RigidPoses.__dataclass_fields__:
+        array, before = np.array(getattr(new, name)), getattr(old, name)
+        if name == "clock_m":
+            array[keep_old, : before.shape[1]] = before[keep_old]
+        else:
+            array[keep_old] = before[keep_old]
+        arrays[name] = array
+    return RigidPoses(**arrays)
 
 
 def _or(first: FloatArray, second: npt.ArrayLike) -> FloatArray:
@@ -197,9 +216,8 @@ def _resolve(
     known: Knowledge,
 ) -> tuple[FloatArray, FloatArray]:
     """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
-    usable = poses is not None and np.any(poses.status == RigidStatus.OK)
-    pivot = start_pivot if poses is None else poses.pivot_enu_m
-    rot = start_rot if poses is None else poses.rot_enu_from_mirror
+    pivot = start_pivot if poses is None else _or(poses.pivot_enu_m, start_pivot)
+    rot = start_rot if poses is None else _or(poses.rot_enu_from_mirror, start_rot)
     arm = np.einsum("mab,mrb->mra", rot, places)
     to_receiver = (pivot[:, None] + arm)[:, :, None] - transmitter
     distance = np.linalg.norm(to_receiver, axis=-1)
@@ -221,12 +239,12 @@ def _resolve(
         offset_free = not np.isfinite(known.clock_sigma_m)
         slope = centred - centred[:, :1] if offset_free else slope - slope[:, :1]
         noise = noise if offset_free else noise + 2.0 * known.clock_sigma_m**2
-    if usable:
-        assert poses is not None
-        predicted = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
-    else:
-        assert start_sigma is not None
-        predicted = np.broadcast_to((start_sigma**2)[:, None, None], left.shape)
+    predicted = np.full(left.shape, np.nan)
+    if start_sigma is not None:
+        predicted[:] = (start_sigma**2)[:, None, None]
+    if poses is not None:
+        from_pose = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
+        predicted = np.where(np.isfinite(from_pose), from_pose, predicted)
     sigma = np.sqrt(predicted + noise)
     offset_risk = np.zeros(left.shape[:2])
     if offset_free:

@@ -322,7 +322,8 @@ def _clock_ties(
     transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says nothing.
     """
     n_mirror, _, n_receiver, _ = weight.shape
-    largest = max(float(weight.max(initial=0.0)), 1e-300)
+    # each mirror's own scale, so that no mirror's result depends on its neighbours
+    largest = np.maximum(weight.max(axis=(1, 2, 3), initial=0.0), 1e-300)
     own = np.zeros((n_mirror, n_class, n_receiver))
     for k in range(n_class):
         known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
@@ -332,10 +333,10 @@ def _clock_ties(
         if np.isfinite(clock_sigma_m):
             own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
         else:
-            own[:, k] = np.where(seen, own[:, k], largest)
+            own[:, k] = np.where(seen, own[:, k], largest[:, None])
     tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
     if np.isfinite(clock_sigma_m):
-        tie[:] = largest / (n_receiver * max(float(clock_sigma_m) ** 2 * largest, 1e-8))
+        tie[:] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None, None]
     return own, tie
 
 
