@@ -31,8 +31,15 @@ def command(output: Path, seed: int, force: bool) -> None:
     with progress("Preparing") as shown:
         outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage)
     if wants_json():
-        emit_json({**outcome.evaluation.as_dict(), "files": outcome.files})
+        emit_json(
+            {
+                **outcome.evaluation.as_dict(),
+                "independent": outcome.independent.as_dict(),
+                "files": outcome.files,
+            }
+        )
         return
-    show_evaluation(outcome.evaluation, title="Mirror normals measured by radio")
+    show_evaluation(outcome.independent, title="Each receiver located on its own, as published")
+    show_evaluation(outcome.evaluation, title="All phases of a mirror at once, carrier included")
     for what, path in outcome.files.items():
         say(f"{what.replace('_', ' ')}: {path}")

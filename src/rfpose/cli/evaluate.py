@@ -49,7 +49,7 @@ def command(result: Path, truth: Path | None) -> None:
             row.id,
             str(row.solved),
             str(row.failed),
-            *(f"{value:.3f}" for value in (row.normal_error_mrad.rms, row.normal_error_mrad.max, row.bound_mrad)),
+            *(f"{value:.3g}" for value in (row.normal_error_mrad.rms, row.normal_error_mrad.max, row.bound_mrad)),
         ]
         for row in evaluation.heliostats
     ]
@@ -71,4 +71,4 @@ def show_evaluation(evaluation: Evaluation, *, title: str) -> None:
 
 
 def _row(name: str, error: Statistics, bound: float, *, factor: float) -> list[str]:
-    return [name, *(f"{factor * value:.3f}" for value in (error.rms, error.median, error.max, bound))]
+    return [name, *(f"{factor * value:.3g}" for value in (error.rms, error.median, error.max, bound))]

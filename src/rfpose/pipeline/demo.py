@@ -14,6 +14,7 @@ from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result_file import write_poses_csv
 from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.solve import solve
 from rfpose.recording import open_recording
 
 __all__ = ["STAGES", "DemoOutcome", "run_demo", "shipped_scenario"]
@@ -34,6 +35,8 @@ class DemoOutcome:
     """What the demo found and where it left its files, by what they are."""
 
     evaluation: Evaluation
+    independent: Evaluation
+    """The same phases with each receiver located on its own, as published."""
     files: dict[str, Path]
 
 
@@ -91,8 +94,10 @@ def run_demo(
     result = process(files["recording"], files["result"], force=force, on_progress=on_progress)
     tell(STAGES[2])
     evaluation = evaluate(result)
+    settings = {**result.settings, "pose": "independent"}
+    independent = evaluate(solve(result.tones, result.scenario, settings=settings, truth=result.truth))
     write_poses_csv(result, files["poses"])
     draw_field_map(result, files["field_map"], evaluation=evaluation)
     with open_recording(files["recording"]) as recording:
         draw_spectrum(recording, files["spectrum"])
-    return DemoOutcome(evaluation=evaluation, files=files)
+    return DemoOutcome(evaluation=evaluation, independent=independent, files=files)

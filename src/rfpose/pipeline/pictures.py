@@ -70,7 +70,7 @@ def draw_field_map(result: Result, path: str | Path, *, evaluation: Evaluation |
         x, y = places[~solved, :2].T
         axes.scatter(x, y, s=80, marker="x", color="k", zorder=4, label="heliostat, not solved")
     for name, place, value, offset in zip(scenario.heliostat_ids, places, mrad, _behind(measured), strict=True):
-        text = f"{name}\n{value:.2f}" if np.isfinite(value) else name
+        text = f"{name}\n{value:.2g}" if np.isfinite(value) else name
         axes.annotate(text, place[:2], offset, textcoords="offset points", fontsize=7, ha="center", va="center")
     _mark(axes, scenario.transmitter_enu_m, scenario.transmitter_ids, marker="^", label="transmitter")
     names = tuple(receiver.id for receiver in scenario.calibration_receiver)
