@@ -1,0 +1,15 @@
+"""Poses of rigid mirrors where ground or walls reflect."""
+
+from rfpose.multilat.ground.model import LEVEL_GROUND, Reflector, Surface, fresnel_coefficient, range_shift_m
+from rfpose.multilat.ground.solve import GroundSolution, GroundStatus, solve_with_ground
+
+__all__ = [
+    "LEVEL_GROUND",
+    "GroundSolution",
+    "GroundStatus",
+    "Reflector",
+    "Surface",
+    "fresnel_coefficient",
+    "range_shift_m",
+    "solve_with_ground",
+]

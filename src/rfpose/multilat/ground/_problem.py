@@ -1,0 +1,263 @@
+"""Arrays of many mirrors for the kernels, their state between fits, and one fit at given coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from rfpose.checks import FloatArray
+from rfpose.multilat.ground import _kernels
+from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid.pose import Knowledge, _bias_info, _clock_ties, _pivot_prior, _start_clock, _weights
+
+__all__ = ["Problem", "State", "build"]
+
+IntArray = npt.NDArray[np.int64]
+
+MAX_ITERATION = 30
+_FLOOR = 1e-13
+NO_TURN: FloatArray = np.zeros((1, 3))
+
+
+@dataclass(slots=True, kw_only=True)
+class State:
+    """Where each mirror stands: mirror is the first axis. Changed in place by fits.
+
+    ``cov`` is at given coefficients; ``follow`` is how pose and clocks move with the coefficients, ``schur`` and
+    ``rest`` the information and gradient a mirror leaves for them.
+    """
+
+    pivot: FloatArray
+    rot: FloatArray
+    clock: FloatArray
+    cov: FloatArray
+    follow: FloatArray
+    schur: FloatArray
+    rest: FloatArray
+    chi2: FloatArray
+    n_iteration: IntArray
+    status: IntArray
+
+    @classmethod
+    def begin(cls, pivot: FloatArray, rot: FloatArray, clock: FloatArray, status: IntArray, n_parameter: int) -> State:
+        """Nothing solved yet."""
+        n_mirror, n_class, n_receiver = clock.shape
+        return cls(
+            pivot=pivot.copy(),
+            rot=rot.copy(),
+            clock=clock.copy(),
+            cov=np.full((n_mirror, 6, 6), np.nan),
+            follow=np.zeros((n_mirror, 6 + n_class * n_receiver, n_parameter)),
+            schur=np.zeros((n_mirror, n_parameter, n_parameter)),
+            rest=np.zeros((n_mirror, n_parameter)),
+            chi2=np.full(n_mirror, np.inf),
+            n_iteration=np.zeros(n_mirror, np.int64),
+            status=status.copy(),
+        )
+
+    def take(self, rows: IntArray) -> State:
+        """Copy some mirrors."""
+        return State(**{f.name: getattr(self, f.name)[rows].copy() for f in fields(self)})
+
+    def copy(self) -> State:
+        """Copy all."""
+        return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
+
+    def put(self, rows: IntArray, other: State) -> None:
+        """Write mirrors back."""
+        for f in fields(self):
+            getattr(self, f.name)[rows] = getattr(other, f.name)
+
+    def move(self, step: FloatArray) -> None:
+        """Let poses and clocks follow a change of the coefficients, to first order."""
+        change = self.follow @ step
+        self.pivot += change[:, :3]
+        turn = change[:, 3:6]
+        length = np.linalg.norm(turn, axis=1, keepdims=True)
+        turn = turn * np.minimum(1.0, 0.2 / np.maximum(length, 1e-300))
+        self.rot[:] = np.where(
+            np.isfinite(self.rot), Rotation.from_rotvec(np.nan_to_num(turn)).as_matrix() @ self.rot, np.nan
+        )
+        self.clock += change[:, 6:].reshape(self.clock.shape)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """Measurements of mirrors, what is known of them, and the planes.
+
+    Attributes
+    ----------
+    scene
+        Coefficients given are in it; estimated ones are put in by `fit`.
+    mirrors
+    calibration : (calibration receiver, xyz)
+        [m]; empty where Φ does not carry their reflections.
+    dof : (mirror,)
+        Measurements and priors less a mirror's own unknowns.
+    """
+
+    scene: _kernels.Scene
+    mirrors: _kernels.Mirrors
+    calibration: FloatArray
+    dof: FloatArray
+
+    @property
+    def n_parameter(self) -> int:
+        """Real and imaginary parts of all estimated coefficients."""
+        return 2 * int(np.sum(self.scene.column >= 0))
+
+    def first_parameter(self) -> FloatArray:
+        """No reflection; as Fresnel's formulas have it where they give the coefficient."""
+        free = self.scene.column >= 0
+        return np.stack([self.scene.kind[free] != 0, np.zeros(int(free.sum()))], axis=1).astype(np.float64).ravel()
+
+    def clip(self, parameter: FloatArray) -> FloatArray:
+        """Keep coefficients below one, where phases would turn over, and factors on Fresnel's formulas below two."""
+        size = np.maximum(np.hypot(parameter[0::2], parameter[1::2]), 1e-300)
+        largest = np.where(self.scene.kind[self.scene.column >= 0] == 0, 0.95, 2.0)
+        return np.asarray(parameter * np.repeat(np.minimum(1.0, largest / size), 2))
+
+    def take(self, rows: IntArray) -> Problem:
+        """Select mirrors."""
+        m = self.mirrors
+        mirrors = m._replace(
+            **{name: getattr(m, name)[rows] for name in m._fields if name not in ("clock_class", "roll_info")}
+        )
+        return replace(self, mirrors=mirrors, dof=self.dof[rows])
+
+    def scene_at(self, parameter: FloatArray) -> _kernels.Scene:
+        """Return the scene with estimated coefficients put in, and with what the calibration receivers see of them."""
+        coefficient = self.scene.coefficient.copy()
+        free = self.scene.column >= 0
+        coefficient[free] = parameter[0::2] + 1j * parameter[1::2]
+        scene = self.scene._replace(coefficient=coefficient)
+        if len(self.calibration) and len(coefficient):
+            seen = np.zeros((len(self.calibration), *scene.common.shape))
+            _kernels.shifts_at_points(scene, self.calibration, seen)
+            scene = scene._replace(common=seen.mean(axis=0))
+        return scene
+
+    def fit(
+        self,
+        state: State,
+        parameter: FloatArray,
+        *,
+        turn: FloatArray = NO_TURN,
+        enough: FloatArray | float = np.inf,
+        max_iteration: int = MAX_ITERATION,
+    ) -> None:
+        """Solve every mirror at given coefficients from where ``state`` stands, or from there turned by ``turn``.
+
+        One that does not converge keeps pose and chi² of its last step.
+        """
+        n_mirror = len(state.chi2)
+        _kernels.fit_many(
+            self.scene_at(parameter),
+            self.mirrors,
+            max_iteration,
+            _FLOOR,
+            turn,
+            np.array(np.broadcast_to(enough, (n_mirror,)), np.float64),
+            state.pivot,
+            state.rot,
+            state.clock,
+            state.cov,
+            state.follow,
+            state.schur,
+            state.rest,
+            state.chi2,
+            state.n_iteration,
+            state.status,
+        )
+
+    def predict(self, state: State, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
+        predicted = np.empty(self.mirrors.z.shape)
+        slope = np.empty((*predicted.shape, 6 + self.n_parameter))
+        scene = self.scene_at(parameter)
+        _kernels.predict_many(scene, self.mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope)
+        return predicted, slope
+
+    def direct(self) -> Problem:
+        """Leave all reflections out."""
+        scene = self.scene
+        n_transmitter, n_group, _ = scene.common.shape
+        return replace(
+            self,
+            calibration=np.empty((0, 3)),
+            scene=scene._replace(
+                image=scene.image[:0],
+                normal=scene.normal[:0],
+                kind=scene.kind[:0],
+                permittivity=scene.permittivity[:0],
+                coefficient=scene.coefficient[:0],
+                column=scene.column[:0],
+                common=np.zeros((n_transmitter, n_group, 4)),
+            ),
+        )
+
+
+def build(
+    scene: _kernels.Scene,
+    places: FloatArray,
+    observations: Sequence[Observation],
+    range_m: Sequence[FloatArray],
+    pivot: FloatArray,
+    rot: FloatArray,
+    *,
+    calibration: FloatArray,
+    known: Knowledge,
+) -> tuple[Problem, FloatArray]:
+    """Lay out observations with their integers resolved; also clocks (mirror, class, receiver) that fit the poses."""
+    z = np.stack(range_m, axis=1)
+    n_mirror, n_group, _, n_transmitter = z.shape
+    weight = _weights(z, np.stack([np.broadcast_to(o.sigma_m, z[:, 0].shape) for o in observations], axis=1))
+    common_sigma = np.stack(
+        [np.broadcast_to(o.transmitter_sigma_m, (n_mirror, n_transmitter)) for o in observations], axis=1
+    )
+    bias_info = _bias_info(common_sigma, (n_mirror, n_group, n_transmitter))
+    classes = np.array([o.clock_class for o in observations], np.int64)
+    n_class = int(classes.max()) + 1
+    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
+    seen = np.stack([np.any(weight[:, classes == k] > 0.0, axis=(1, 3)) for k in range(n_class)], axis=1)
+    prior, prior_info = _pivot_prior(known, n_mirror)
+    clock = _start_clock(scene.transmitter, places, pivot, rot, z, classes, n_class)
+    mirrors = _kernels.Mirrors(
+        receiver_mirror=np.ascontiguousarray(places),
+        z=np.nan_to_num(z),
+        weight=weight,
+        bias_info=bias_info,
+        clock_class=classes,
+        pivot_prior=prior,
+        pivot_info=prior_info,
+        roll_info=known.roll_sigma_rad**-2 if known.two_axis else 0.0,
+        clock_own=own,
+        clock_tie=tie,
+        clock_prior=clock.copy(),
+    )
+    dof = _dof(weight, bias_info, seen, classes, known)
+    return Problem(scene=scene, mirrors=mirrors, calibration=calibration, dof=dof), clock
+
+
+def _dof(
+    weight: FloatArray, bias_info: FloatArray, seen: FloatArray, classes: IntArray, known: Knowledge
+) -> FloatArray:
+    """Count measurements and priors less unknowns.
+
+    Without a calibrated transmitter a class's common clock is no unknown of its own: the transmitters' errors hold it.
+    """
+    observed = weight > 0.0
+    n = observed.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0
+    n -= (np.any(observed, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
+    for k in range(seen.shape[1]):
+        clocks = seen[:, k].sum(axis=1)
+        if np.isfinite(known.clock_sigma_m):
+            clocks = np.minimum(clocks, 1)
+        held = ~np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
+        n -= np.maximum(clocks - held, 0)
+    n += 3 * (known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)) + known.two_axis
+    return np.asarray(n)
