@@ -236,7 +236,7 @@ def _command_one(p, k, prepared, m, out, state, moved, wanted):
     for a in range(2):
         angle = azimuth if a == 0 else elevation
         best = np.nan
-        for turn in range(-1, 2):
+        for turn in (0, -1, 1):
             goal = angle + 2.0 * math.pi * turn
             worm = 0.0
             for _ in range(8):

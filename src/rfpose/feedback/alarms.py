@@ -86,13 +86,12 @@ def alarms(
     index = np.flatnonzero(np.isfinite(error).all(axis=1))
     for axis in (0, 1):
         series = error[index, axis]
-        cuts = _cuts(series, shift_rad, least_run)
+        cuts = _steps(series, _cuts(series, shift_rad, least_run), shift_rad)
         edges = [0, *cuts, len(series)]
-        for before, at, after in zip(edges, edges[1:], edges[2:], strict=False):
-            step = float(np.median(series[at:after]) - np.median(series[before:at]))
-            if abs(step) > shift_rad:
-                last = int(index[after - 1])
-                found.append(Alarm(kind="shift", first=int(index[at]), last=last, axis=axis + 1, size_rad=step))
+        for at, after in itertools.pairwise(edges[1:]):
+            step = _step(series, cuts, at)
+            last = int(index[after - 1])
+            found.append(Alarm(kind="shift", first=int(index[at]), last=last, axis=axis + 1, size_rad=step))
         for a, b in itertools.pairwise(edges):
             drift = _drift(series[a:b], shift_rad)
             if drift is not None:
@@ -130,6 +129,25 @@ def _cuts(series: npt.NDArray[np.float64], limit: float, least: int) -> list[int
         cuts.append(stop)
         stop = int(origin[stop])
     return cuts[::-1]
+
+
+def _step(series: npt.NDArray[np.float64], cuts: list[int], at: int) -> float:
+    """Difference of the medians after and before a cut."""
+    edges = [0, *cuts, len(series)]
+    i = edges.index(at, 1)
+    return float(np.median(series[at : edges[i + 1]]) - np.median(series[edges[i - 1] : at]))
+
+
+def _steps(series: npt.NDArray[np.float64], cuts: list[int], limit: float) -> list[int]:
+    """Cuts without those whose step is within the limit: a slope is no staircase."""
+    left = list(cuts)
+    while left:
+        sizes = [abs(_step(series, left, at)) for at in left]
+        smallest = int(np.argmin(sizes))
+        if sizes[smallest] > limit:
+            break
+        left.pop(smallest)
+    return left
 
 
 def _drift(part: npt.NDArray[np.float64], limit: float) -> float | None:

@@ -429,7 +429,8 @@ def solve(
     working = fitted[:, index]
     working[~enough] = np.nan
     noise[~enough] = np.nan
-    known = _uncertainty(fitted, k, count, row, masked, index, scale, noise, weight, settings)
+    spread = np.where(enough & (noise > 0.0), noise, 1.0)
+    known = _uncertainty(fitted, k, count, row, masked, index, scale, spread, weight, settings)
     covariance, ambiguity, rank, condition, length = known
     blind = np.einsum("hff->hf", ambiguity) > 0.02
     sigma = np.sqrt(np.einsum("hff->hf", covariance))
@@ -503,7 +504,8 @@ def _uncertainty(
         jacobian = _kernels.jacobian_batch(p[s], k[s], count[s], row[s], use[s], index, scale)
         norm = np.linalg.norm(residual, axis=-1)
         spread = _efficiency(norm / noise[s, None], use[s], settings) * noise[s] ** 2
-        jacobian *= (use[s] / np.sqrt(spread)[:, None])[..., None, None]
+        # an exact fit has no scatter of its own; keep clear of zero
+        jacobian *= (use[s] / np.sqrt(np.maximum(spread, 1e-18))[:, None])[..., None, None]
         prior = np.broadcast_to(np.diag(np.sqrt(prior_weight)), (len(jacobian), len(index), len(index)))
         rows = np.concatenate([jacobian.reshape(len(jacobian), -1, len(index)), prior], axis=1)
         parts.append(_subspaces(np.nan_to_num(rows), settings.rank_tolerance))
@@ -525,8 +527,8 @@ def _efficiency(norm: FloatArray, use: npt.NDArray[np.bool_], settings: FitSetti
     n = np.maximum(use.sum(axis=1), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         curvature = np.where(norm <= cut, 1.0, 0.5 * cut / norm)
-    slope = 0.5 * np.sum(np.where(use, np.minimum(norm, cut) ** 2, 0.0), axis=1) / n
-    return np.asarray(slope / (np.sum(np.where(use, curvature, 0.0), axis=1) / n) ** 2)
+        slope = 0.5 * np.sum(np.where(use, np.minimum(norm, cut) ** 2, 0.0), axis=1) / n
+        return np.asarray(slope / (np.sum(np.where(use, curvature, 0.0), axis=1) / n) ** 2)
 
 
 def _subspaces(

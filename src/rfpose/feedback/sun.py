@@ -15,7 +15,7 @@ from rfpose.errors import InvalidInputError
 
 __all__ = ["Site", "Sun", "sun_position", "unix_seconds"]
 
-# ΔT = TT − UT1 has been 69 s to within 0.4 s since 2017; a second is 0.04 µrad of the sun's own motion.
+# ΔT = TT − UT1 has been 69 s to within 0.4 s since 2017; a second is 0.2 µrad of the sun's own motion.
 _DELTA_T_S = 69.2
 
 
