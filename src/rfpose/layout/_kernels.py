@@ -1,0 +1,847 @@
+"""Kernels of layout studies: dilution, bounds of normals with their gradients, occlusion.
+
+Arrays of transmitters are (xyz, transmitter), so that sums over transmitters vectorise. ``visible`` is (mirror,
+receiver, transmitter), or has no rows when everything is seen. A mirror whose pose is not determined gives NaN.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from rfpose.jit import kernel, kernel_parallel
+
+# Smallest share of an unknown's information that the others may leave before it counts as unobserved.
+FLOOR = 1e-13
+# det M below this part of (tr M)³ means a plane or a line, as in `rfpose.multilat`.
+SINGULAR_DET = 1e-12
+
+DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
+
+
+@kernel
+def invert(m, q):
+    """Set q = m⁻¹ for a symmetric 3×3; False where m is singular."""
+    c00 = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    c01 = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    c02 = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    det = m[0, 0] * c00 + m[0, 1] * c01 + m[0, 2] * c02
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    if not det > SINGULAR_DET * trace * trace * trace:
+        return False
+    s = 1.0 / det
+    q[0, 0] = s * c00
+    q[0, 1] = q[1, 0] = s * c01
+    q[0, 2] = q[2, 0] = s * c02
+    q[1, 1] = s * (m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2])
+    q[1, 2] = q[2, 1] = s * (m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2])
+    q[2, 2] = s * (m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1])
+    return True
+
+
+@kernel
+def arm_of(rot, place, out):
+    """Set out = rot @ place."""
+    for a in range(3):
+        out[a] = rot[a, 0] * place[0] + rot[a, 1] * place[1] + rot[a, 2] * place[2]
+
+
+@kernel
+def turn_slopes(rot, slope, jac):
+    """Turn slopes of the normal by receivers' places (receiver, 3, 3) to places in ENU: jac = slope rotᵀ."""
+    for k in range(slope.shape[0]):
+        for i in range(3):
+            for c in range(3):
+                jac[k, i, c] = slope[k, i, 0] * rot[c, 0] + slope[k, i, 1] * rot[c, 1] + slope[k, i, 2] * rot[c, 2]
+
+
+@kernel
+def directions(transmitter, x, y, z, u, inverse):
+    """Unit vectors u (3, transmitter) from the transmitters to a point, and inverse distances."""
+    for t in range(transmitter.shape[1]):
+        dx = x - transmitter[0, t]
+        dy = y - transmitter[1, t]
+        dz = z - transmitter[2, t]
+        a = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+        u[0, t] = dx * a
+        u[1, t] = dy * a
+        u[2, t] = dz * a
+        inverse[t] = a
+
+
+@kernel
+def moments(u, w, s, m):
+    """Weighted sums of a receiver's directions: s (4) = Σ w (u, 1), m (3, 3) = Σ w u uᵀ."""
+    sw = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    for t in range(w.shape[0]):
+        x, y, z, b = u[0, t], u[1, t], u[2, t], w[t]
+        sw += b
+        sx += b * x
+        sy += b * y
+        sz += b * z
+        xx += b * x * x
+        xy += b * x * y
+        xz += b * x * z
+        yy += b * y * y
+        yz += b * y * z
+        zz += b * z * z
+    s[0] = sx
+    s[1] = sy
+    s[2] = sz
+    s[3] = sw
+    m[0, 0] = xx
+    m[0, 1] = m[1, 0] = xy
+    m[0, 2] = m[2, 0] = xz
+    m[1, 1] = yy
+    m[1, 2] = m[2, 1] = yz
+    m[2, 2] = zz
+
+
+@kernel
+def centre(s, m):
+    """Take the clock out of a receiver's moments: m − s sᵀ/Σw."""
+    x, y, z = s[0], s[1], s[2]
+    f = 1.0 / s[3]
+    m[0, 0] -= f * x * x
+    m[0, 1] -= f * x * y
+    m[0, 2] -= f * x * z
+    m[1, 0] = m[0, 1]
+    m[1, 1] -= f * y * y
+    m[1, 2] -= f * y * z
+    m[2, 0] = m[0, 2]
+    m[2, 1] = m[1, 2]
+    m[2, 2] -= f * z * z
+
+
+@kernel
+def row_weights(weight, inverse, range2, visible, seen_all, w):
+    """Set w = weight, less what is not seen; with free-space loss where range2 (reference range²) is positive."""
+    for t in range(w.shape[0]):
+        b = weight[t]
+        if range2 > 0.0:
+            b *= range2 * inverse[t] * inverse[t]
+        w[t] = b
+    if not seen_all:
+        for t in range(w.shape[0]):
+            w[t] *= visible[t]
+
+
+@kernel
+def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
+    """Do rows ``begin`` to ``end`` of `dop_rows`."""
+    n_transmitter = transmitter.shape[1]
+    seen_all = visible.shape[0] == 0
+    m = np.empty((3, 3))
+    q = np.empty((3, 3))
+    s = np.empty(4)
+    u = np.empty((3, n_transmitter))
+    inverse = np.empty(n_transmitter)
+    w = weight.copy()
+    for i in range(begin, end):
+        x, y, z = point[i, 0], point[i, 1], point[i, 2]
+        if not seen_all:
+            for t in range(n_transmitter):
+                w[t] = weight[t] * visible[i, t]
+        directions(transmitter, x, y, z, u, inverse)
+        moments(u, w, s, m)
+        centre(s, m)
+        if invert(m, q):
+            out[i, 0] = q[0, 0]
+            out[i, 1] = q[1, 1]
+            out[i, 2] = q[2, 2]
+
+
+@kernel_parallel
+def dop_rows(transmitter, weight, visible, point, n_chunk, out):
+    """Variances east, north, up of each point per unit of one transmitter's range variance; (point, xyz)."""
+    n = point.shape[0]
+    for chunk in numba.prange(n_chunk):
+        dop_rows_part(n * chunk // n_chunk, n * (chunk + 1) // n_chunk, transmitter, weight, visible, point, out)
+
+
+@kernel
+def tilt_independent_part(
+    begin, end, transmitter, place, plane_slope, pivot, rot, own, common, range2, visible, n_min, out
+):
+    """Do rows ``begin`` to ``end`` of `tilt_independent`."""
+    n_group, n_transmitter = own.shape
+    n_receiver = place.shape[1]
+    seen_all = visible.shape[0] == 0
+    calibrated = np.any(common > 0.0)
+    arm = np.empty(3)
+    jac = np.empty((n_receiver, 3, 3))
+    u = np.empty((n_receiver, 3, n_transmitter))
+    inverse = np.empty(n_transmitter)
+    w = np.empty((n_receiver, n_group, n_transmitter))
+    variance = np.empty((n_receiver, n_group, n_transmitter))
+    mean = np.empty((n_receiver, n_group, 3))
+    none = np.empty(n_transmitter, np.uint8)
+    s = np.empty(4)
+    part = np.empty((3, 3))
+    m = np.empty((3, 3))
+    q = np.empty((3, 3))
+    gain = np.empty((n_receiver, 3, 3))
+    for i in range(begin, end):
+        here = place[i % place.shape[0]]
+        turn_slopes(rot[i], plane_slope[i % place.shape[0]], jac)
+        total = 0.0
+        good = True
+        for r in range(n_receiver):
+            arm_of(rot[i], here[r], arm)
+            directions(transmitter, pivot[i, 0] + arm[0], pivot[i, 1] + arm[1], pivot[i, 2] + arm[2], u[r], inverse)
+            mask = none if seen_all else visible[i, r]
+            m[:] = 0.0
+            seen = 0
+            for g in range(n_group):
+                for t in range(n_transmitter):
+                    loss = 1.0
+                    if range2 > 0.0:
+                        loss = range2 * inverse[t] * inverse[t]
+                    variance[r, g, t] = own[g, t] / loss
+                    b = 1.0 / (variance[r, g, t] + common[g, t])
+                    if not seen_all:
+                        b *= mask[t]
+                    w[r, g, t] = b
+                moments(u[r], w[r, g], s, part)
+                for a in range(3):
+                    mean[r, g, a] = s[a] / s[3]
+                    for b in range(3):
+                        m[a, b] += part[a, b] - s[a] * s[b] / s[3]
+            if not seen_all:
+                for t in range(n_transmitter):
+                    seen += mask[t]
+                if seen < n_min:
+                    good = False
+            if not good or not invert(m, q):
+                good = False
+                break
+            for a in range(3):
+                for b in range(3):
+                    gain[r, a, b] = jac[r, a, 0] * q[0, b] + jac[r, a, 1] * q[1, b] + jac[r, a, 2] * q[2, b]
+            if not calibrated:
+                for a in range(3):
+                    for b in range(3):
+                        total += gain[r, a, b] * jac[r, a, b]
+        if not good:
+            continue
+        if calibrated:
+            for g in range(n_group):
+                for t in range(n_transmitter):
+                    tx = ty = tz = 0.0
+                    for r in range(n_receiver):
+                        b = w[r, g, t]
+                        x = b * (u[r, 0, t] - mean[r, g, 0])
+                        y = b * (u[r, 1, t] - mean[r, g, 1])
+                        z = b * (u[r, 2, t] - mean[r, g, 2])
+                        vx = gain[r, 0, 0] * x + gain[r, 0, 1] * y + gain[r, 0, 2] * z
+                        vy = gain[r, 1, 0] * x + gain[r, 1, 1] * y + gain[r, 1, 2] * z
+                        vz = gain[r, 2, 0] * x + gain[r, 2, 1] * y + gain[r, 2, 2] * z
+                        total += variance[r, g, t] * (vx * vx + vy * vy + vz * vz)
+                        tx += vx
+                        ty += vy
+                        tz += vz
+                    total += common[g, t] * (tx * tx + ty * ty + tz * tz)
+        out[i] = total
+
+
+@kernel_parallel
+def tilt_independent(transmitter, place, plane_slope, pivot, rot, own, common, range2, visible, n_min, n_chunk, out):
+    """Variance of the normal [rad²] from fits of each receiver by itself; (mirror,).
+
+    ``own``, ``common`` (group, transmitter): variances of a receiver's own noise and of the calibration's.
+    """
+    n = pivot.shape[0]
+    for chunk in numba.prange(n_chunk):
+        tilt_independent_part(
+            n * chunk // n_chunk,
+            n * (chunk + 1) // n_chunk,
+            transmitter,
+            place,
+            plane_slope,
+            pivot,
+            rot,
+            own,
+            common,
+            range2,
+            visible,
+            n_min,
+            out,
+        )
+
+
+@kernel
+def eliminate(info, n, keep):
+    """Cholesky-eliminate the first n − keep unknowns in place (lower triangle); False where one is unobserved."""
+    for j in range(n - keep):
+        d = info[j, j]
+        if not d > 0.0:
+            return False
+        for a in range(j + 1, n):
+            f = info[a, j] / d
+            if f != 0.0:
+                for b in range(j + 1, a + 1):
+                    info[a, b] -= f * info[b, j]
+    return True
+
+
+@kernel
+def add_receiver(info, arm, s, m, clock, first):
+    """Add one receiver's observations: clock's place ``clock``, pivot's ``first``, rotation's ``first + 3``."""
+    ax, ay, az = arm[0], arm[1], arm[2]
+    for a in range(3):
+        for b in range(a + 1):
+            info[first + a, first + b] += m[a, b]
+    info[clock, clock] += s[3]
+    for b in range(3):
+        # column b of M; (arm × column) is what the rotation sees
+        cx, cy, cz = m[0, b], m[1, b], m[2, b]
+        info[first + 3, first + b] += ay * cz - az * cy
+        info[first + 4, first + b] += az * cx - ax * cz
+        info[first + 5, first + b] += ax * cy - ay * cx
+    for a in range(3):
+        if a == 0:
+            k0, k1, k2 = 0.0, -az, ay
+        elif a == 1:
+            k0, k1, k2 = az, 0.0, -ax
+        else:
+            k0, k1, k2 = -ay, ax, 0.0
+        # row a of [arm]× M
+        x = k0 * m[0, 0] + k1 * m[1, 0] + k2 * m[2, 0]
+        y = k0 * m[0, 1] + k1 * m[1, 1] + k2 * m[2, 1]
+        z = k0 * m[0, 2] + k1 * m[1, 2] + k2 * m[2, 2]
+        info[first + 3 + a, first + 3] += ay * z - az * y
+        if a >= 1:
+            info[first + 3 + a, first + 4] += az * x - ax * z
+        if a == 2:
+            info[first + 5, first + 5] += ax * y - ay * x
+        info[first + a, clock] += s[a]
+    info[first + 3, clock] += ay * s[2] - az * s[1]
+    info[first + 4, clock] += az * s[0] - ax * s[2]
+    info[first + 5, clock] += ax * s[1] - ay * s[0]
+
+
+@kernel
+def add_arm(ax, ay, az, m, pp, tp, tt):
+    """Add a receiver's centred moments: pp += M, tp += [arm]× M, tt += [arm]× M [arm]×ᵀ (lower triangle)."""
+    pp[0, 0] += m[0, 0]
+    pp[0, 1] += m[0, 1]
+    pp[0, 2] += m[0, 2]
+    pp[1, 1] += m[1, 1]
+    pp[1, 2] += m[1, 2]
+    pp[2, 2] += m[2, 2]
+    x0, y0, z0 = ay * m[2, 0] - az * m[1, 0], ay * m[2, 1] - az * m[1, 1], ay * m[2, 2] - az * m[1, 2]
+    x1, y1, z1 = az * m[0, 0] - ax * m[2, 0], az * m[0, 1] - ax * m[2, 1], az * m[0, 2] - ax * m[2, 2]
+    x2, y2, z2 = ax * m[1, 0] - ay * m[0, 0], ax * m[1, 1] - ay * m[0, 1], ax * m[1, 2] - ay * m[0, 2]
+    tp[0, 0] += x0
+    tp[0, 1] += y0
+    tp[0, 2] += z0
+    tp[1, 0] += x1
+    tp[1, 1] += y1
+    tp[1, 2] += z1
+    tp[2, 0] += x2
+    tp[2, 1] += y2
+    tp[2, 2] += z2
+    tt[0, 0] += ay * z0 - az * y0
+    tt[1, 0] += ay * z1 - az * y1
+    tt[1, 1] += az * x1 - ax * z1
+    tt[2, 0] += ay * z2 - az * y2
+    tt[2, 1] += az * x2 - ax * z2
+    tt[2, 2] += ax * y2 - ay * x2
+
+
+@kernel
+def tilt_calibrated_part(
+    begin, end, transmitter, place, pivot, rot, weight, shared, pivot_info, roll_info, range2, visible, out
+):
+    """Do rows ``begin`` to ``end`` of `tilt_calibrated`."""
+    n_transmitter = transmitter.shape[1]
+    n_receiver = place.shape[1]
+    seen_all = visible.shape[0] == 0
+    arm = np.empty(3)
+    u = np.empty((3, n_transmitter))
+    inverse = np.empty(n_transmitter)
+    w = weight.copy()
+    none = np.empty(n_transmitter, np.uint8)
+    s = np.empty(4)
+    m = np.empty((3, 3))
+    q = np.empty((3, 3))
+    pp = np.empty((3, 3))
+    tp = np.empty((3, 3))
+    tt = np.empty((3, 3))
+    mean = np.empty(7)
+    for i in range(begin, end):
+        here = place[i % place.shape[0]]
+        pp[:] = 0.0
+        tp[:] = 0.0
+        tt[:] = 0.0
+        mean[:] = 0.0
+        for r in range(n_receiver):
+            arm_of(rot[i], here[r], arm)
+            directions(transmitter, pivot[i, 0] + arm[0], pivot[i, 1] + arm[1], pivot[i, 2] + arm[2], u, inverse)
+            if not seen_all or range2 > 0.0:
+                row_weights(weight, inverse, range2, none if seen_all else visible[i, r], seen_all, w)
+            moments(u, w, s, m)
+            if shared:
+                mean[0] += s[0]
+                mean[1] += s[1]
+                mean[2] += s[2]
+                mean[3] += arm[1] * s[2] - arm[2] * s[1]
+                mean[4] += arm[2] * s[0] - arm[0] * s[2]
+                mean[5] += arm[0] * s[1] - arm[1] * s[0]
+                mean[6] += s[3]
+            elif s[3] > 0.0:
+                centre(s, m)
+            add_arm(arm[0], arm[1], arm[2], m, pp, tp, tt)
+        trace = pp[0, 0] + pp[1, 1] + pp[2, 2]
+        turn = tt[0, 0] + tt[1, 1] + tt[2, 2]
+        if shared:
+            f = 1.0 / mean[6]
+            for a in range(3):
+                fa = f * mean[a]
+                fb = f * mean[3 + a]
+                for b in range(a, 3):
+                    pp[a, b] -= fa * mean[b]
+                for b in range(3):
+                    tp[a, b] -= fb * mean[b]
+                for b in range(a + 1):
+                    tt[a, b] -= fb * mean[3 + b]
+        for a in range(3):
+            pp[a, a] += pivot_info
+        if roll_info > 0.0:
+            j0, j1 = rot[i, 1, 0], -rot[i, 0, 0]
+            tt[0, 0] += roll_info * j0 * j0
+            tt[1, 0] += roll_info * j0 * j1
+            tt[1, 1] += roll_info * j1 * j1
+        if not trace > 0.0 or not invert(pp, q):
+            continue
+        for a in range(3):
+            x = tp[a, 0] * q[0, 0] + tp[a, 1] * q[1, 0] + tp[a, 2] * q[2, 0]
+            y = tp[a, 0] * q[0, 1] + tp[a, 1] * q[1, 1] + tp[a, 2] * q[2, 1]
+            z = tp[a, 0] * q[0, 2] + tp[a, 1] * q[1, 2] + tp[a, 2] * q[2, 2]
+            for b in range(a + 1):
+                m[a, b] = tt[a, b] - (x * tp[b, 0] + y * tp[b, 1] + z * tp[b, 2])
+                m[b, a] = m[a, b]
+        # what is left of the rotation must stand out of the rounding of what came off
+        if m[0, 0] + m[1, 1] + m[2, 2] > FLOOR * turn and invert(m, q):
+            total = q[0, 0] + q[1, 1] + q[2, 2]
+            for a in range(3):
+                for b in range(3):
+                    total -= rot[i, a, 2] * q[a, b] * rot[i, b, 2]
+            out[i] = total
+
+
+@kernel_parallel
+def tilt_calibrated(
+    transmitter, place, pivot, rot, weight, shared, pivot_info, roll_info, range2, visible, n_chunk, out
+):
+    """Variance of the normal [rad²] of rigid mirrors with perfectly calibrated transmitters; (mirror,).
+
+    ``weight`` (transmitter,) is the sum over tones. Clocks, one a receiver or one a mirror (``shared``), come off as
+    means, the pivot as a block: far less arithmetic than `tilt_rigid`, and the same result.
+    """
+    n = pivot.shape[0]
+    for chunk in numba.prange(n_chunk):
+        tilt_calibrated_part(
+            n * chunk // n_chunk,
+            n * (chunk + 1) // n_chunk,
+            transmitter,
+            place,
+            pivot,
+            rot,
+            weight,
+            shared,
+            pivot_info,
+            roll_info,
+            range2,
+            visible,
+            out,
+        )
+
+
+@kernel
+def tilt_rigid_part(
+    begin,
+    end,
+    transmitter,
+    place,
+    pivot,
+    rot,
+    weight,
+    bias_info,
+    group_class,
+    n_class,
+    shared,
+    tie,
+    pivot_info,
+    roll_info,
+    range2,
+    visible,
+    out,
+):
+    """Do rows ``begin`` to ``end`` of `tilt_rigid`."""
+    n_group, n_transmitter = weight.shape
+    n_receiver = place.shape[1]
+    n_clock = 1 if shared else n_receiver
+    first = n_class * n_clock
+    size = first + 6
+    seen_all = visible.shape[0] == 0
+    uncalibrated = np.zeros(n_group, np.bool_)
+    known = np.zeros(n_class, np.bool_)
+    for g in range(n_group):
+        for t in range(n_transmitter):
+            if bias_info[g, t] < np.inf:
+                uncalibrated[g] = True
+            if bias_info[g, t] > 0.0:
+                known[group_class[g]] = True
+    info = np.zeros((size, size))
+    arm = np.empty((n_receiver, 3))
+    u = np.empty((n_receiver, 3, n_transmitter))
+    inverse = np.empty((n_receiver, n_transmitter))
+    w = np.empty((n_receiver, n_transmitter))
+    none = np.empty(n_transmitter, np.uint8)
+    s = np.empty(4)
+    m = np.empty((3, 3))
+    q = np.empty((3, 3))
+    row = np.empty(size)
+    before = np.empty(size)
+    for i in range(begin, end):
+        here = place[i % place.shape[0]]
+        info[:] = 0.0
+        for r in range(n_receiver):
+            arm_of(rot[i], here[r], arm[r])
+            directions(
+                transmitter, pivot[i, 0] + arm[r, 0], pivot[i, 1] + arm[r, 1], pivot[i, 2] + arm[r, 2], u[r],
+                inverse[r],
+            )  # fmt: skip
+        for g in range(n_group):
+            for r in range(n_receiver):
+                mask = none if seen_all else visible[i, r]
+                row_weights(weight[g], inverse[r], range2, mask, seen_all, w[r])
+                clock = group_class[g] * n_clock + (0 if shared else r)
+                moments(u[r], w[r], s, m)
+                add_receiver(info, arm[r], s, m, clock, first)
+            if uncalibrated[g]:
+                for t in range(n_transmitter):
+                    row[:] = 0.0
+                    total = 0.0
+                    for r in range(n_receiver):
+                        b = w[r, t]
+                        x, y, z = b * u[r, 0, t], b * u[r, 1, t], b * u[r, 2, t]
+                        total += b
+                        row[group_class[g] * n_clock + (0 if shared else r)] += b
+                        row[first] += x
+                        row[first + 1] += y
+                        row[first + 2] += z
+                        row[first + 3] += arm[r, 1] * z - arm[r, 2] * y
+                        row[first + 4] += arm[r, 2] * x - arm[r, 0] * z
+                        row[first + 5] += arm[r, 0] * y - arm[r, 1] * x
+                    if total > 0.0:
+                        scale = 1.0 / (total + bias_info[g, t])
+                        for a in range(size):
+                            f = scale * row[a]
+                            for b in range(a + 1):
+                                info[a, b] -= f * row[b]
+        for a in range(3):
+            info[first + a, first + a] += pivot_info
+        if roll_info > 0.0:
+            j0, j1 = rot[i, 1, 0], -rot[i, 0, 0]
+            info[first + 3, first + 3] += roll_info * j0 * j0
+            info[first + 4, first + 3] += roll_info * j0 * j1
+            info[first + 4, first + 4] += roll_info * j1 * j1
+        for k in range(n_class):
+            if not known[k]:
+                # nothing tells a common clock from the transmitters' errors: hold the first, which says nothing
+                info[k * n_clock, k * n_clock] += max(info[first, first], 1.0)
+            if not shared and tie > 0.0:
+                for a in range(n_clock):
+                    for b in range(a):
+                        ka, kb = k * n_clock + a, k * n_clock + b
+                        info[ka, ka] += tie
+                        info[kb, kb] += tie
+                        info[ka, kb] -= tie
+        for a in range(size):
+            before[a] = info[a, a]
+        if not eliminate(info, size, 3):
+            continue
+        good = True
+        for a in range(size):
+            if not info[a, a] > FLOOR * before[a]:
+                good = False
+        if not good:
+            continue
+        for a in range(3):
+            for b in range(a + 1):
+                m[a, b] = m[b, a] = info[first + 3 + a, first + 3 + b]
+        if not invert(m, q):
+            continue
+        total = 0.0
+        for a in range(3):
+            total += q[a, a]
+            for b in range(3):
+                total -= rot[i, a, 2] * q[a, b] * rot[i, b, 2]
+        out[i] = total
+
+
+@kernel_parallel
+def tilt_rigid(
+    transmitter,
+    place,
+    pivot,
+    rot,
+    weight,
+    bias_info,
+    group_class,
+    n_class,
+    shared,
+    tie,
+    pivot_info,
+    roll_info,
+    range2,
+    visible,
+    n_chunk,
+    out,
+):
+    """Variance of the normal [rad²] of rigid mirrors; (mirror,).
+
+    ``weight``, ``bias_info`` (group, transmitter): 1/variance of own noise and of the transmitter's own error
+    (infinite = perfectly calibrated, 0 = not at all). ``shared``: one clock a mirror and class; else one a receiver,
+    whose differences have information ``tie`` a pair.
+    """
+    n = pivot.shape[0]
+    for chunk in numba.prange(n_chunk):
+        tilt_rigid_part(
+            n * chunk // n_chunk,
+            n * (chunk + 1) // n_chunk,
+            transmitter,
+            place,
+            pivot,
+            rot,
+            weight,
+            bias_info,
+            group_class,
+            n_class,
+            shared,
+            tie,
+            pivot_info,
+            roll_info,
+            range2,
+            visible,
+            out,
+        )
+
+
+@kernel
+def objective_rows_part(begin, end, method, transmitter, weight, place, plane_slope, pivot, rot, value, gradient):
+    """Do rows ``begin`` to ``end`` of `objective_rows`."""
+    n_transmitter = transmitter.shape[1]
+    n_receiver = 1 if method == DOP else place.shape[1]
+    size = 3 if method <= INDEPENDENT else 6
+    u = np.empty((n_receiver, 3, n_transmitter))
+    inverse = np.empty((n_receiver, n_transmitter))
+    row = np.empty((n_receiver, n_transmitter, 6))
+    arm = np.zeros((n_receiver, 3))
+    jac = np.empty((n_receiver, 3, 3))
+    mean = np.empty((n_receiver, 6))
+    info = np.empty((6, 6))
+    weighed = np.empty((6, 6))
+    cov = np.empty((6, 6))
+    q3 = np.empty((3, 3))
+    for i in range(begin, end):
+        if method == INDEPENDENT:
+            turn_slopes(rot[i], plane_slope[i % place.shape[0]], jac)
+        for r in range(n_receiver):
+            if method != DOP:
+                arm_of(rot[i], place[i % place.shape[0], r], arm[r])
+            directions(
+                transmitter, pivot[i, 0] + arm[r, 0], pivot[i, 1] + arm[r, 1], pivot[i, 2] + arm[r, 2], u[r],
+                inverse[r],
+            )  # fmt: skip
+        fill_rows(u, arm, weight, size, method == SHARED, row, mean)
+        value[i] = 0.0
+        info[:] = 0.0
+        for r in range(n_receiver):
+            if size == 3:
+                info[:] = 0.0
+            for t in range(n_transmitter):
+                for a in range(size):
+                    f = weight[t] * row[r, t, a]
+                    for b in range(a + 1):
+                        info[a, b] += f * row[r, t, b]
+            if size == 3:
+                mirror_up(info, 3)
+                if not invert(info, q3):
+                    value[i] = np.nan
+                    break
+                value[i] += weigh_position(method, q3, jac[r], weighed)
+                add_gradient(r, 3, weight, row, u, inverse, arm, weighed, gradient[i])
+        if size == 6:
+            mirror_up(info, 6)
+            if not invert_spd(info, 6, cov):
+                value[i] = np.nan
+                continue
+            value[i] = weigh_rotation(cov, rot[i], weighed)
+            for r in range(n_receiver):
+                add_gradient(r, 6, weight, row, u, inverse, arm, weighed, gradient[i])
+
+
+@kernel_parallel
+def objective_rows(method, transmitter, weight, place, plane_slope, pivot, rot, n_chunk, value, gradient):
+    """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
+
+    ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
+    Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
+    """
+    n = pivot.shape[0]
+    for chunk in numba.prange(n_chunk):
+        objective_rows_part(
+            n * chunk // n_chunk,
+            n * (chunk + 1) // n_chunk,
+            method,
+            transmitter,
+            weight,
+            place,
+            plane_slope,
+            pivot,
+            rot,
+            value,
+            gradient,
+        )
+
+
+@kernel
+def fill_rows(u, arm, weight, size, shared, row, mean):
+    """Rows of the Jacobian less their mean: over the receiver's transmitters, or over all where a clock is shared."""
+    n_receiver, n_transmitter = row.shape[0], row.shape[1]
+    total = 0.0
+    for t in range(n_transmitter):
+        total += weight[t]
+    for r in range(n_receiver):
+        mean[r] = 0.0
+        for t in range(n_transmitter):
+            x, y, z = u[r, 0, t], u[r, 1, t], u[r, 2, t]
+            row[r, t, 0] = x
+            row[r, t, 1] = y
+            row[r, t, 2] = z
+            row[r, t, 3] = arm[r, 1] * z - arm[r, 2] * y
+            row[r, t, 4] = arm[r, 2] * x - arm[r, 0] * z
+            row[r, t, 5] = arm[r, 0] * y - arm[r, 1] * x
+            for a in range(size):
+                mean[r, a] += weight[t] / total * row[r, t, a]
+    for a in range(size):
+        if shared:
+            s = 0.0
+            for r in range(n_receiver):
+                s += mean[r, a] / n_receiver
+            for r in range(n_receiver):
+                mean[r, a] = s
+        for r in range(n_receiver):
+            for t in range(n_transmitter):
+                row[r, t, a] -= mean[r, a]
+
+
+@kernel
+def mirror_up(a, n):
+    """Fill the upper triangle from the lower."""
+    for i in range(n):
+        for j in range(i):
+            a[j, i] = a[i, j]
+
+
+@kernel
+def invert_spd(a, n, out):
+    """Set out = a⁻¹ of a positive definite matrix by Gauss-Jordan on a copy; False where it is singular."""
+    work = a[:n, :n].copy()
+    out[:n, :n] = 0.0
+    for i in range(n):
+        out[i, i] = 1.0
+    for j in range(n):
+        p = work[j, j]
+        if not p > FLOOR * a[j, j]:
+            return False
+        for k in range(n):
+            work[j, k] /= p
+            out[j, k] /= p
+        for i in range(n):
+            if i != j:
+                f = work[i, j]
+                for k in range(n):
+                    work[i, k] -= f * work[j, k]
+                    out[i, k] -= f * out[j, k]
+    return True
+
+
+@kernel
+def weigh_position(method, q, jac, weighed):
+    """Return tr(B q), and weighed = q B q, with B the identity (dilution) or jacᵀ jac (normal)."""
+    total = 0.0
+    for a in range(3):
+        for b in range(3):
+            weighed[a, b] = 0.0
+    for k in range(3):
+        # row k of jac q, or of q
+        x = y = z = 0.0
+        if method == DOP:
+            x, y, z = q[k, 0], q[k, 1], q[k, 2]
+            total += q[k, k]
+        else:
+            for c in range(3):
+                x += jac[k, c] * q[c, 0]
+                y += jac[k, c] * q[c, 1]
+                z += jac[k, c] * q[c, 2]
+            total += x * jac[k, 0] + y * jac[k, 1] + z * jac[k, 2]
+        v = (x, y, z)
+        for a in range(3):
+            for b in range(3):
+                weighed[a, b] += v[a] * v[b]
+    return total
+
+
+@kernel
+def weigh_rotation(cov, rot, weighed):
+    """Return the normal's variance, and weighed = C G C with G the rotation's part across the normal."""
+    total = 0.0
+    for a in range(6):
+        for b in range(6):
+            weighed[a, b] = 0.0
+    for axis in range(2):
+        # tilts about the mirror's x and y axes
+        for a in range(6):
+            x = 0.0
+            for c in range(3):
+                x += cov[a, 3 + c] * rot[c, axis]
+            weighed[a, a] += x * x
+            if a >= 3:
+                total += x * rot[a - 3, axis]
+            for b in range(a):
+                y = 0.0
+                for c in range(3):
+                    y += cov[b, 3 + c] * rot[c, axis]
+                weighed[a, b] += x * y
+                weighed[b, a] += x * y
+    return total
+
+
+@kernel
+def add_gradient(r, size, weight, row, u, inverse, arm, weighed, gradient):
+    """Add one receiver's part of the derivative of the variance by the transmitters' positions."""
+    v = np.empty(6)
+    for t in range(weight.shape[0]):
+        for a in range(size):
+            s = 0.0
+            for b in range(size):
+                s += weighed[a, b] * row[r, t, b]
+            v[a] = s
+        x, y, z = v[0], v[1], v[2]
+        if size == 6:
+            # (arm × du) · v = du · (v × arm)
+            x += v[4] * arm[r, 2] - v[5] * arm[r, 1]
+            y += v[5] * arm[r, 0] - v[3] * arm[r, 2]
+            z += v[3] * arm[r, 1] - v[4] * arm[r, 0]
+        along = x * u[r, 0, t] + y * u[r, 1, t] + z * u[r, 2, t]
+        # du = −(I − u uᵀ)/d dT, so the minus of −2 Σ … turns
+        f = 2.0 * weight[t] * inverse[r, t]
+        gradient[t, 0] += f * (x - along * u[r, 0, t])
+        gradient[t, 1] += f * (y - along * u[r, 1, t])
+        gradient[t, 2] += f * (z - along * u[r, 2, t])

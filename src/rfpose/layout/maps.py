@@ -1,0 +1,569 @@
+"""Sensitivity maps: what every mirror's normal can be known to, before anything is built.
+
+Everything follows from the Jacobian of the solvers in `rfpose.multilat` and from the noise of the tones; nothing is
+measured. All angles are of the mirror normal; the beam turns by twice as much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, as_float_array, read_only
+from rfpose.dsp.bounds import phase_bound_rad
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.layout import _kernels
+from rfpose.scenario import Scenario
+
+__all__ = [
+    "ESTIMATORS",
+    "Dilution",
+    "Estimator",
+    "Mirrors",
+    "Noise",
+    "check_site",
+    "dilution",
+    "disc_points",
+    "mirrors_facing",
+    "mirrors_of",
+    "noise_of",
+    "normal_map",
+    "normal_without_each",
+    "summarise",
+]
+
+_COINCIDENT_M = 1e-6
+_FLAT = 1e-6
+"""Extent of the transmitters across a line or plane, as a share of their largest, below which they lie in it."""
+_MIN_TRANSMITTER = {2: 4, 3: 5}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimator:
+    """How normals are made of phases, and what is known besides.
+
+    Attributes
+    ----------
+    name
+        For tables and pictures.
+    rigid
+        All receivers of a mirror in one fit; else each by itself and the plane through them.
+    clock_sigma_m
+        Of each receiver's delay about the mirror's common clock: 0 one shared clock, infinity one a receiver [m].
+    carrier
+        Use the carrier's phase between a mirror's receivers, too (integers known).
+    pivot_sigma_m
+        Survey of the pivot in each axis; infinity: unknown [m].
+    two_axis, roll_sigma_rad
+        An azimuth-elevation mount keeps the mirror's x axis horizontal this well.
+    """
+
+    name: str
+    rigid: bool = True
+    clock_sigma_m: float = np.inf
+    carrier: bool = False
+    pivot_sigma_m: float = np.inf
+    two_axis: bool = False
+    roll_sigma_rad: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if not self.clock_sigma_m >= 0.0:
+            raise InvalidInputError(f"`clock_sigma_m` must not be negative, got {self.clock_sigma_m}")
+        if not self.pivot_sigma_m > 0.0:
+            raise InvalidInputError(f"`pivot_sigma_m` must be greater than zero, got {self.pivot_sigma_m}")
+        if not self.roll_sigma_rad > 0.0:
+            raise InvalidInputError(f"`roll_sigma_rad` must be greater than zero, got {self.roll_sigma_rad}")
+
+
+ESTIMATORS = {
+    e.name: e
+    for e in (
+        Estimator(name="independent", rigid=False),
+        Estimator(name="rigid"),
+        Estimator(name="shared-clock", clock_sigma_m=0.0),
+        Estimator(name="carrier", clock_sigma_m=0.0, carrier=True),
+        Estimator(name="pivot", clock_sigma_m=0.0, pivot_sigma_m=0.005),
+    )
+}
+"""Ready estimators; ``pivot`` has pivots surveyed to 5 mm and a shared clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """Range noise of the tones and of the carrier; arrays are read-only.
+
+    Attributes
+    ----------
+    tone_sigma_m : (tone, transmitter)
+        A receiver's own noise of one transmitter's range, at ``reference_range_m`` if that is given [m].
+    calibration_sigma_m : (tone, transmitter)
+        Of the transmitter phases, the same for all receivers of a frame [m].
+    carrier_sigma_m : (transmitter,) or None
+        Own noise of the carrier's phase as a range [m].
+    reference_range_m
+        Noise grows with range over this (free space); None: noise is the same everywhere.
+    """
+
+    tone_sigma_m: FloatArray
+    calibration_sigma_m: FloatArray
+    carrier_sigma_m: FloatArray | None = None
+    reference_range_m: float | None = None
+
+    @classmethod
+    def uniform(cls, n_transmitter: int, sigma_m: float = 1.0, calibration_sigma_m: float = 0.0) -> Noise:
+        """Return one tone, all transmitters alike."""
+        if not sigma_m > 0.0 or calibration_sigma_m < 0.0:
+            raise InvalidInputError("`sigma_m` must be greater than zero and `calibration_sigma_m` not negative")
+        shape = (1, n_transmitter)
+        return cls(
+            tone_sigma_m=read_only(np.full(shape, float(sigma_m))),
+            calibration_sigma_m=read_only(np.full(shape, float(calibration_sigma_m))),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mirrors:
+    """Mirrors in one posture each.
+
+    Attributes
+    ----------
+    pivot_enu_m : (mirror, xyz)
+    rot_enu_from_mirror : (mirror, 3, 3)
+    receiver_mirror_m : (1 or mirror, receiver, xyz)
+        Receivers from the pivot, in the mirror frame [m].
+    """
+
+    pivot_enu_m: FloatArray
+    rot_enu_from_mirror: FloatArray
+    receiver_mirror_m: FloatArray
+
+    @property
+    def normal_enu(self) -> FloatArray:
+        """(mirror, xyz) unit normals."""
+        return self.rot_enu_from_mirror[:, :, 2]
+
+    @property
+    def receiver_enu_m(self) -> FloatArray:
+        """(mirror, receiver, xyz) [m]."""
+        places = np.broadcast_to(self.receiver_mirror_m, (len(self.pivot_enu_m), *self.receiver_mirror_m.shape[1:]))
+        return np.asarray(self.pivot_enu_m[:, None] + np.einsum("mab,mrb->mra", self.rot_enu_from_mirror, places))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Dilution:
+    """Dilution of precision at points: RMS error per unit of ONE transmitter's range sigma; NaN where undetermined.
+
+    Attributes
+    ----------
+    position, horizontal, vertical : (point,)
+    """
+
+    position: FloatArray
+    horizontal: FloatArray
+    vertical: FloatArray = field(repr=False)
+
+
+def check_site(transmitter_enu_m: npt.ArrayLike, *, n_axis: int = 3) -> FloatArray:
+    """Return the transmitters, or say which of the paper's placement guidelines they break.
+
+    Raises
+    ------
+    GeometryError
+        Fewer than the dimensions plus two; two at one place; all on a line or in a plane (the direction in which
+        positions cannot be told is named).
+    """
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", n_axis))
+    needed = _MIN_TRANSMITTER[n_axis]
+    if len(transmitter) < needed:
+        raise GeometryError(
+            f"{len(transmitter)} transmitters cannot fix a position in {n_axis} dimensions: at least {needed} are "
+            "needed (guideline: N >= D + 2); add transmitters"
+        )
+    extent = transmitter.max(axis=0) - transmitter.min(axis=0)
+    apart = np.linalg.norm(transmitter[:, None] - transmitter, axis=2) + np.eye(len(transmitter)) * (1.0 + extent.max())
+    if apart.min() < _COINCIDENT_M:
+        i, j = (int(k) for k in np.argwhere(apart < _COINCIDENT_M)[0])
+        raise GeometryError(f"transmitters {i} and {j} stand at the same place; move or remove one")
+    _, size, axes = np.linalg.svd(transmitter - transmitter.mean(axis=0))
+    if size[-1] > _FLAT * size[0]:
+        return transmitter
+    null = axes[-1] * np.where(axes[-1][np.argmax(np.abs(axes[-1]))] < 0.0, -1.0, 1.0)
+    direction = ", ".join(f"{x:.3f}" for x in null + 0.0)
+    if size[1] <= _FLAT * size[0] or n_axis == 2:
+        along = ", ".join(f"{x:.3f}" for x in axes[0] + 0.0)
+        raise GeometryError(
+            f"all transmitters stand on one line along ({along}): nothing across it can be told (guideline: "
+            "transmitters spread around the field); move some off the line"
+        )
+    raise GeometryError(
+        f"all transmitters stand in one plane: positions along its normal ({direction}) cannot be told near the plane "
+        "(guideline: transmitters at different heights); raise or lower some"
+    )
+
+
+def disc_points(n_point: int, *, radius_m: float = 1.0, height_m: float = 0.0) -> FloatArray:
+    """Return (point, xyz) points spread evenly over a disc, each for the same area (sunflower)."""
+    k = np.arange(n_point) + 0.5
+    radius = radius_m * np.sqrt(k / n_point)
+    angle = np.pi * (3.0 - np.sqrt(5.0)) * k
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(n_point, float(height_m))], axis=1)
+
+
+def dilution(
+    transmitter_enu_m: npt.ArrayLike, point_enu_m: npt.ArrayLike, *, visible: npt.ArrayLike | None = None
+) -> Dilution:
+    """Return the dilution of precision of positions from range differences.
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz) or (transmitter, xy)
+        [m]. Two columns solve the plane (Swart et al. Fig. 7).
+    point_enu_m : (..., xyz) or (..., xy)
+        [m].
+    visible : (..., transmitter), optional
+        Which transmitters each point receives; all by default.
+
+    Returns
+    -------
+    Dilution
+        Arrays (...). In the plane ``vertical`` is zero.
+    """
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", "xyz"))
+    n_axis = transmitter.shape[1]
+    if n_axis not in (2, 3):
+        raise InvalidInputError(f"`transmitter_enu_m` must have two or three columns, got {n_axis}")
+    point = as_float_array("point_enu_m", point_enu_m, ("...", n_axis), finite=False)
+    lead = point.shape[:-1]
+    flat = point.reshape(-1, n_axis)
+    if n_axis == 2:
+        variance = _planar(transmitter, flat, visible)
+    else:
+        variance = np.full((len(flat), 3), np.nan)
+        seen = _mask(visible, (len(flat), len(transmitter)), lead)
+        _kernels.dop_rows(
+            np.ascontiguousarray(transmitter.T), np.ones(len(transmitter)), seen, flat, _chunks(len(flat)), variance
+        )
+    root = np.sqrt(variance)
+    return Dilution(
+        position=np.sqrt(variance.sum(axis=1)).reshape(lead),
+        horizontal=np.hypot(root[:, 0], root[:, 1]).reshape(lead),
+        vertical=root[:, 2].reshape(lead),
+    )
+
+
+def _planar(transmitter: FloatArray, point: FloatArray, visible: npt.ArrayLike | None) -> FloatArray:
+    """(point, xyz) variances in the plane, z zero."""
+    offset = point[:, None] - transmitter
+    with np.errstate(invalid="ignore", divide="ignore"):
+        u = offset / np.linalg.norm(offset, axis=2, keepdims=True)
+        weight = np.ones(u.shape[:2]) if visible is None else np.asarray(visible, np.float64).reshape(u.shape[:2])
+        u = u - (np.einsum("nt,ntx->nx", weight, u) / weight.sum(axis=1)[:, None])[:, None]
+        m = np.einsum("nt,ntx,nty->nxy", weight, u, u)
+        det = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2
+        det = np.where(det > 1e-12 * (m[:, 0, 0] + m[:, 1, 1]) ** 2, det, np.nan)
+        return np.stack([m[:, 1, 1] / det, m[:, 0, 0] / det, 0.0 * det], axis=1)
+
+
+def normal_map(
+    transmitter_enu_m: npt.ArrayLike,
+    mirrors: Mirrors,
+    noise: Noise,
+    estimator: Estimator,
+    *,
+    visible: npt.ArrayLike | None = None,
+) -> FloatArray:
+    """Return the bound of each mirror's normal, as the RMS angle (mirror,) [rad]; NaN where undetermined.
+
+    Agrees with `rfpose.multilat.normal_bound` (independent) and `rfpose.multilat.rigid.rigid_bound` (rigid).
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    mirrors, noise, estimator
+        See there.
+    visible : (mirror, receiver, transmitter), optional
+        Which transmitters each receiver sees; all by default.
+
+    Raises
+    ------
+    InvalidInputError
+        Shapes that do not fit; an estimator that needs the carrier where ``noise`` has none.
+    """
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    n_transmitter = len(transmitter)
+    if noise.tone_sigma_m.shape[1] != n_transmitter:
+        raise InvalidInputError(f"`noise` must hold {n_transmitter} transmitters, got {noise.tone_sigma_m.shape[1]}")
+    n_mirror, n_receiver = len(mirrors.pivot_enu_m), mirrors.receiver_mirror_m.shape[1]
+    seen = _mask(visible, (n_mirror, n_receiver, n_transmitter), (n_mirror, n_receiver))
+    range2 = 0.0 if noise.reference_range_m is None else noise.reference_range_m**2
+    out = np.full(n_mirror, np.nan)
+    by_axis = np.ascontiguousarray(transmitter.T)
+    if not estimator.rigid:
+        _kernels.tilt_independent(
+            by_axis, mirrors.receiver_mirror_m, _plane_slope(mirrors.receiver_mirror_m), mirrors.pivot_enu_m,
+            mirrors.rot_enu_from_mirror, noise.tone_sigma_m**2, noise.calibration_sigma_m**2, range2, seen,
+            _MIN_TRANSMITTER[3], _chunks(n_mirror), out,
+        )  # fmt: skip
+        return np.asarray(np.sqrt(out))
+    shared = estimator.clock_sigma_m == 0.0
+    roll_info = estimator.roll_sigma_rad**-2 if estimator.two_axis else 0.0
+    calibrated = not estimator.carrier and not np.any(noise.calibration_sigma_m > 0.0)
+    if calibrated and (shared or np.isinf(estimator.clock_sigma_m)):
+        _kernels.tilt_calibrated(
+            by_axis, mirrors.receiver_mirror_m, mirrors.pivot_enu_m, mirrors.rot_enu_from_mirror,
+            (noise.tone_sigma_m**-2.0).sum(axis=0), shared, estimator.pivot_sigma_m**-2, roll_info, range2, seen,
+            _chunks(n_mirror), out,
+        )  # fmt: skip
+        return np.asarray(np.sqrt(out))
+    weight, bias_info, group_class = _groups(noise, estimator)
+    tie = 0.0
+    if not shared and np.isfinite(estimator.clock_sigma_m):
+        tie = 1.0 / (n_receiver * estimator.clock_sigma_m**2)
+    _kernels.tilt_rigid(
+        by_axis, mirrors.receiver_mirror_m, mirrors.pivot_enu_m, mirrors.rot_enu_from_mirror, weight, bias_info,
+        group_class, 2 if estimator.carrier else 1, shared, tie, estimator.pivot_sigma_m**-2,
+        roll_info, range2, seen, _chunks(n_mirror), out,
+    )  # fmt: skip
+    return np.asarray(np.sqrt(out))
+
+
+def _groups(noise: Noise, estimator: Estimator) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
+    """Own weights and transmitters' information (group, transmitter), clock class (group,): tones, then carrier."""
+    weight = noise.tone_sigma_m**-2.0
+    with np.errstate(divide="ignore"):
+        bias_info = noise.calibration_sigma_m**-2.0
+    group_class = np.zeros(len(weight), np.int64)
+    if not estimator.carrier:
+        return weight, bias_info, group_class
+    if noise.carrier_sigma_m is None:
+        raise InvalidInputError(f"`noise` must hold the carrier's for estimator `{estimator.name}`")
+    carrier = noise.carrier_sigma_m[None] ** -2.0
+    return (
+        np.concatenate([weight, carrier]),
+        np.concatenate([bias_info, np.zeros_like(carrier)]),
+        np.append(group_class, 1),
+    )
+
+
+def _plane_slope(receiver_mirror_m: FloatArray) -> FloatArray:
+    """(mirror, receiver, 3, 3) derivative of the plane's unit normal by each receiver's place, in the mirror frame.
+
+    The plane is the affine image of the mirror's x-y plane, as `rfpose.multilat.mirror_normal` takes it.
+    """
+    centred = receiver_mirror_m - receiver_mirror_m.mean(axis=1, keepdims=True)
+    a, b = np.moveaxis(np.linalg.pinv(centred, rcond=1e-3)[:, :2], 1, 0)
+    p = np.einsum("mk,mkx->mx", a, centred)
+    q = np.einsum("mk,mkx->mx", b, centred)
+    cross = np.cross(p, q)
+    length = np.linalg.norm(cross, axis=1)
+    normal = cross / length[:, None]
+    basis = np.eye(3)
+    # d(p × q) = a_k dR × q + b_k p × dR, then only what is across the normal
+    change = a[:, :, None, None] * np.cross(basis, q[:, None])[:, None]
+    change = change + b[:, :, None, None] * np.cross(p[:, None], basis)[:, None]
+    across = (basis - normal[:, :, None] * normal[:, None]) / length[:, None, None]
+    return np.ascontiguousarray(np.einsum("mij,mkcj->mkic", across, change))
+
+
+def normal_without_each(
+    transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, estimator: Estimator
+) -> FloatArray:
+    """Return the bound of each mirror's normal with each transmitter lost in turn (transmitter, mirror) [rad]."""
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    rows = []
+    for lost in range(len(transmitter)):
+        left = np.arange(len(transmitter)) != lost
+        carrier = noise.carrier_sigma_m
+        fewer = Noise(
+            tone_sigma_m=np.ascontiguousarray(noise.tone_sigma_m[:, left]),
+            calibration_sigma_m=np.ascontiguousarray(noise.calibration_sigma_m[:, left]),
+            carrier_sigma_m=None if carrier is None else np.ascontiguousarray(carrier[left]),
+            reference_range_m=noise.reference_range_m,
+        )
+        rows.append(normal_map(transmitter[left], mirrors, fewer, estimator))
+    return np.array(rows)
+
+
+def mirrors_facing(
+    pivot_enu_m: npt.ArrayLike,
+    receiver_mirror_m: npt.ArrayLike,
+    *,
+    normal_enu: npt.ArrayLike | None = None,
+    aim_enu_m: npt.ArrayLike | None = None,
+    sun_enu: npt.ArrayLike | None = None,
+    arm_m: float = 0.0,
+) -> Mirrors:
+    """Return mirrors in a posture: a given normal, or reflecting the sun onto an aim point.
+
+    Parameters
+    ----------
+    pivot_enu_m : (mirror, xyz)
+        [m].
+    receiver_mirror_m : (receiver, xyz) or (mirror, receiver, xyz)
+        In the mirror frame, from the mirror's centre [m].
+    normal_enu : (xyz,) or (mirror, xyz), optional
+        Need not be of unit length.
+    aim_enu_m, sun_enu : (xyz,), optional
+        Aim point [m] and direction of the sun; both, where ``normal_enu`` is not given.
+    arm_m
+        Mirror's centre from the pivot, along the normal [m].
+
+    Raises
+    ------
+    InvalidInputError
+        Neither a normal nor aim and sun.
+    GeometryError
+        Receivers on a line; a mirror that would have to face both ways.
+    """
+    # copies: a read-only array would be another type to the kernels, compiled anew
+    pivot = np.array(as_float_array("pivot_enu_m", pivot_enu_m, ("mirror", 3)))
+    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("...", "receiver", 3))
+    if places.ndim == 2:
+        places = places[None]
+    for place in places[:1] if len(places) == 1 else places:
+        if geometry.is_collinear(place):
+            raise GeometryError("`receiver_mirror_m` must hold three or more receivers that are not on a line")
+    if normal_enu is None:
+        if aim_enu_m is None or sun_enu is None:
+            raise InvalidInputError("give `normal_enu`, or `aim_enu_m` and `sun_enu`")
+        aim = as_float_array("aim_enu_m", aim_enu_m, (3,))
+        normal = geometry.bisector_enu(aim - pivot, as_float_array("sun_enu", sun_enu, (3,)))
+    else:
+        normal = np.broadcast_to(as_float_array("normal_enu", normal_enu, ("...", 3)), pivot.shape)
+    rot = geometry.rot_enu_from_mirror(normal)
+    if not np.isfinite(rot).all():
+        bad = int(np.flatnonzero(~np.isfinite(rot).all(axis=(1, 2)))[0])
+        raise GeometryError(
+            f"mirror {bad} has no posture: the sun stands opposite its aim point, or its normal is zero"
+        )
+    return Mirrors(
+        pivot_enu_m=pivot,
+        rot_enu_from_mirror=np.ascontiguousarray(rot),
+        receiver_mirror_m=np.ascontiguousarray(places + np.array([0.0, 0.0, float(arm_m)])),
+    )
+
+
+def mirrors_of(
+    scenario: Scenario, *, normal_enu: npt.ArrayLike | None = None, sun_enu: npt.ArrayLike | None = None
+) -> Mirrors:
+    """Return a scenario's mirrors in a posture.
+
+    With the given normal; else facing the aim point under the given sun; else with each heliostat's own
+    ``normal_enu``, and level where it has none.
+
+    Raises
+    ------
+    InvalidInputError
+        A sun without ``[site] aim_enu_m``.
+    GeometryError
+        No heliostats; heliostats with different numbers of receivers; heliostats or transmitters on each other.
+    """
+    check_clear(scenario)
+    if len({len(h.receiver_mirror_m) for h in scenario.heliostat}) > 1:
+        raise GeometryError("heliostats have different numbers of receivers; study them in separate scenarios")
+    places = np.array([h.receiver_mirror_m for h in scenario.heliostat])
+    places[:, :, 2] += np.array([h.arm_m for h in scenario.heliostat])[:, None]
+    if (places == places[0]).all():
+        places = places[:1]
+    if normal_enu is None and sun_enu is None:
+        normal_enu = np.array([h.normal_enu or (0.0, 0.0, 1.0) for h in scenario.heliostat])
+    if normal_enu is None and scenario.site.aim_enu_m is None:
+        raise InvalidInputError("[site] `aim_enu_m` is missing: the mirrors have nothing to face; add it, or a normal")
+    return mirrors_facing(
+        scenario.pivot_enu_m, places, normal_enu=normal_enu, aim_enu_m=scenario.site.aim_enu_m, sun_enu=sun_enu
+    )
+
+
+def check_clear(scenario: Scenario) -> None:
+    """Refuse a scenario without heliostats, or with one on top of another or of a transmitter."""
+    from scipy.spatial import KDTree
+
+    if not scenario.heliostat:
+        raise GeometryError("the scenario has no heliostats; add some, or a field from CSV")
+    tree = KDTree(scenario.pivot_enu_m)
+    pairs = sorted(tree.query_pairs(_COINCIDENT_M))
+    if pairs:
+        i, j = pairs[0]
+        ids = scenario.heliostat_ids
+        raise GeometryError(f"heliostats `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one")
+    distance, nearest = (np.asarray(a) for a in tree.query(scenario.transmitter_enu_m))
+    if distance.min() < _COINCIDENT_M:
+        t = int(np.argmin(distance))
+        raise GeometryError(
+            f"heliostat `{scenario.heliostat_ids[nearest[t]]}` and transmitter `{scenario.transmitter_ids[t]}` stand "
+            "at the same place; move one"
+        )
+
+
+def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
+    """Return the noise that a scenario's radio plan allows: each phase at its Cramér–Rao bound.
+
+    Tones: σ_φ = 1/√(n·snr), snr = (a m)²/σ² as `[simulation] tone_snr_db` counts it. Carrier: σ = 1/√(2n)·σ/a.
+    Calibration: the mean of all calibration receivers, each with its noise and the survey of its place.
+
+    Parameters
+    ----------
+    scenario
+        With ``[simulation] path_loss = "free_space"``, noise grows with range.
+    tone_snr_db
+        Overrides ``[simulation] tone_snr_db``.
+    """
+    plan = scenario.simulation
+    snr_first = 10.0 ** ((plan.tone_snr_db if tone_snr_db is None else tone_snr_db) / 10.0)
+    index = np.array([t.modulation_index for t in scenario.tone])
+    amplitude = np.array([t.amplitude for t in scenario.transmitter])
+    snr = snr_first * (index[:, None] / index[0] * amplitude) ** 2
+    n_sample = scenario.radio.frame_samples
+    tone = scenario.wavelength_m[:, None] / (2.0 * np.pi) * phase_bound_rad(n_sample, snr)
+    carrier_snr = 2.0 * snr_first * (amplitude / index[0]) ** 2
+    rf_hz = scenario.radio.centre_frequency_hz + scenario.carrier_hz
+    carrier = None
+    if np.all(rf_hz > 0.0):
+        carrier = scenario.radio.propagation_speed_mps / (2.0 * np.pi * rf_hz) * phase_bound_rad(n_sample, carrier_snr)
+    free = plan.path_loss == "free_space"
+    calibration = np.zeros_like(tone)
+    if scenario.calibration_receiver:
+        distance = np.linalg.norm(scenario.calibration_enu_m[:, None] - scenario.transmitter_enu_m, axis=2)
+        loss = distance / plan.reference_range_m if free else np.ones_like(distance)
+        survey = np.array([r.survey_sigma_m for r in scenario.calibration_receiver])
+        variance = (tone[:, None] * loss) ** 2 + survey[:, None] ** 2
+        calibration = np.sqrt(variance.mean(axis=1) / len(survey))
+    return Noise(
+        tone_sigma_m=read_only(tone),
+        calibration_sigma_m=read_only(calibration),
+        carrier_sigma_m=carrier,
+        reference_range_m=plan.reference_range_m if free else None,
+    )
+
+
+def summarise(values: FloatArray) -> dict[str, float]:
+    """Return rms, median, 95th percentile and worst of a map, and the share without a solution."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return {"rms": np.nan, "median": np.nan, "p95": np.nan, "worst": np.nan, "undetermined": 1.0}
+    return {
+        "rms": float(np.sqrt(np.mean(finite**2))),
+        "median": float(np.median(finite)),
+        "p95": float(np.percentile(finite, 95)),
+        "worst": float(finite.max()),
+        "undetermined": 1.0 - finite.size / values.size,
+    }
+
+
+def _chunks(n: int) -> int:
+    """Pieces to share out: one a thread for small maps, more for large ones."""
+    return max(1, min(8 * numba.get_num_threads(), n // 64 or 1))
+
+
+def _mask(visible: npt.ArrayLike | None, shape: tuple[int, ...], lead: tuple[int, ...]) -> npt.NDArray[np.uint8]:
+    if visible is None:
+        return np.empty((0, *shape[1:]), np.uint8)
+    mask = np.asarray(visible)
+    if mask.shape != (*lead, shape[-1]):
+        raise InvalidInputError(f"`visible` must have shape {(*lead, shape[-1])}, got {mask.shape}")
+    return np.ascontiguousarray(mask.reshape(shape).astype(np.uint8))

@@ -1,0 +1,574 @@
+"""Where to put transmitters: local searches from many starts under a site's constraints, and the price of accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import KDTree
+
+from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.layout import _kernels
+from rfpose.layout.maps import Mirrors, _chunks, _plane_slope, check_site
+from rfpose.scenario import Scenario, Transmitter
+
+__all__ = [
+    "CRITERIA",
+    "Constraints",
+    "Costs",
+    "Placement",
+    "Zone",
+    "evaluate_placement",
+    "optimise",
+    "pareto",
+    "scenario_with",
+]
+
+Criterion = Literal["pdop", "independent", "rigid", "shared-clock"]
+CRITERIA: dict[str, int] = {
+    "pdop": _kernels.DOP,
+    "independent": _kernels.INDEPENDENT,
+    "rigid": _kernels.RIGID,
+    "shared-clock": _kernels.SHARED,
+}
+Progress = Callable[[int, int], None]
+
+_DRAWS = 2000
+"""Random places tried for a tower before the constraints count as impossible."""
+_WORST_POWER = 12.0
+_BAND = 0.02
+"""Width of the ranks that stand for a percentile while searching, so that it has a slope."""
+_FEASIBLE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Zone:
+    """A piece of ground, from above: a polygon, or a circle.
+
+    Attributes
+    ----------
+    corner_enu_m : (corner, xy) or None
+        Polygon, any direction, not closed [m].
+    centre_enu_m, radius_m
+        Circle [m].
+    """
+
+    corner_enu_m: FloatArray | None = None
+    centre_enu_m: tuple[float, float] = (0.0, 0.0)
+    radius_m: float = np.nan
+
+    def __post_init__(self) -> None:
+        if self.corner_enu_m is None:
+            as_positive("radius_m", self.radius_m)
+        elif len(as_float_array("corner_enu_m", self.corner_enu_m, ("corner", 2))) < 3:
+            raise InvalidInputError("`corner_enu_m` must hold three or more corners")
+
+    def depth(self, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how deep each point (point, xy) lies inside [m] (negative: outside), and its slope (point, xy)."""
+        if self.corner_enu_m is None:
+            offset = point - np.asarray(self.centre_enu_m)
+            distance = np.linalg.norm(offset, axis=1)
+            return self.radius_m - distance, -offset / np.maximum(distance, 1e-12)[:, None]
+        start = np.asarray(self.corner_enu_m, np.float64)
+        edge = np.roll(start, -1, axis=0) - start
+        offset = point[:, None] - start
+        along = np.einsum("pcx,cx->pc", offset, edge) / np.maximum((edge**2).sum(axis=1), 1e-300)
+        gap = offset - np.clip(along, 0.0, 1.0)[..., None] * edge
+        nearest = np.argmin((gap**2).sum(axis=2), axis=1)
+        gap = gap[np.arange(len(point)), nearest]
+        distance = np.linalg.norm(gap, axis=1)
+        end = np.roll(start, -1, axis=0)
+        crosses = (start[:, 1] > point[:, 1:]) != (end[:, 1] > point[:, 1:])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = start[:, 0] + (point[:, 1:] - start[:, 1]) / edge[:, 1] * edge[:, 0]
+        inside = np.where((crosses & (point[:, :1] < x)).sum(axis=1) % 2 == 1, 1.0, -1.0)
+        return inside * distance, inside[:, None] * gap / np.maximum(distance, 1e-12)[:, None]
+
+    @property
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """Smallest and largest (xy) coordinates [m]."""
+        if self.corner_enu_m is None:
+            centre = np.asarray(self.centre_enu_m)
+            return centre - self.radius_m, centre + self.radius_m
+        corner = np.asarray(self.corner_enu_m, np.float64)
+        return corner.min(axis=0), corner.max(axis=0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Constraints:
+    """Where transmitters may stand.
+
+    Attributes
+    ----------
+    allowed
+        Each tower stands in one of these zones.
+    height_m
+        Lowest and highest antenna, z in the site frame [m].
+    excluded
+        No tower stands in any of these.
+    separation_m
+        Least horizontal distance between two towers [m].
+    clearance_m
+        Least horizontal distance to a heliostat [m].
+    """
+
+    allowed: tuple[Zone, ...]
+    height_m: tuple[float, float]
+    excluded: tuple[Zone, ...] = ()
+    separation_m: float = 0.0
+    clearance_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        low, high = self.height_m
+        if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+            raise InvalidInputError(f"`height_m` must be (lowest, highest), got {self.height_m}")
+        if not self.allowed:
+            raise InvalidInputError("`allowed` must hold a zone")
+        if self.separation_m < 0.0 or self.clearance_m < 0.0:
+            raise InvalidInputError("`separation_m` and `clearance_m` must not be negative")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Costs:
+    """What new towers cost, in any currency: each, by height above ``ground_m``, by cable.
+
+    Cables run as the shortest tree over all towers and ``cable_start_enu_m``.
+    """
+
+    per_tower: float = 1.0
+    per_height_m: float = 0.0
+    per_cable_m: float = 0.0
+    cable_start_enu_m: tuple[float, float] = (0.0, 0.0)
+    ground_m: float = 0.0
+
+    def of(self, transmitter_enu_m: FloatArray, n_existing: int = 0) -> float:
+        """Return the cost of a site, whose first ``n_existing`` towers stand already (their cables, too)."""
+        new = transmitter_enu_m[n_existing:]
+        height = np.maximum(new[:, 2] - self.ground_m, 0.0).sum()
+        cable = 0.0
+        if self.per_cable_m > 0.0:
+            node = np.vstack([self.cable_start_enu_m, transmitter_enu_m[:, :2]])
+            # the tree takes what is below 1e-8 as not joined
+            length = np.maximum(np.linalg.norm(node[:, None] - node, axis=2), 1e-6)
+            standing = n_existing + 1
+            length[:standing, :standing] = 1e-6
+            cable = float(minimum_spanning_tree(length).sum())
+        return float(self.per_tower * len(new) + self.per_height_m * height + self.per_cable_m * cable)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """Where transmitters should stand.
+
+    Attributes
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        Existing ones first [m].
+    n_existing
+        How many of them stood already.
+    criterion, statistic
+        What was minimised.
+    value
+        Its value over the field: PDOP, or radians of the normal.
+    lost_one
+        The same with the transmitter missing whose loss is worst; NaN where some point is then undetermined.
+    cost
+        Of the new towers.
+    start_value : (start,)
+        What each start came to; NaN where its search failed.
+    """
+
+    transmitter_enu_m: FloatArray
+    n_existing: int
+    criterion: Criterion
+    statistic: str
+    value: float
+    lost_one: float
+    cost: float
+    start_value: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Objective and constraints over the flat, scaled coordinates of the new towers."""
+
+    field: Mirrors
+    criterion: Criterion
+    statistic: str
+    sigma_m: float
+    existing: FloatArray
+    constraints: Constraints
+    scale: float
+    heliostats: KDTree | None
+
+    def site(self, x: FloatArray) -> FloatArray:
+        return np.vstack([self.existing, self.scale * x.reshape(-1, 3)])
+
+    def objective(self, x: FloatArray) -> tuple[float, FloatArray]:
+        """Logarithm of the statistic and its slope."""
+        variance, slope = _rows(self.site(x), self.field, self.criterion, self.sigma_m)
+        if not np.isfinite(variance).all() or variance.min() <= 0.0:
+            return 50.0, np.zeros(x.size)
+        value, weight = _statistic(variance, self.statistic, smooth=True)
+        gradient = np.einsum("p,pta->ta", weight, slope)[len(self.existing) :]
+        return float(np.log(value)), self.scale * gradient.ravel() / value
+
+    def margins(self, x: FloatArray) -> FloatArray:
+        return self._margins(x)[0]
+
+    def margin_slopes(self, x: FloatArray) -> FloatArray:
+        return self._margins(x)[1]
+
+    def _margins(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what must not be negative (constraint,), scaled, and its slope (constraint, variable)."""
+        rules = self.constraints
+        new = x.reshape(-1, 3)
+        ground = self.scale * new[:, :2]
+        n = len(new)
+        value: list[FloatArray] = []
+        slope: list[FloatArray] = []
+
+        def each(depth: FloatArray, by: FloatArray) -> None:
+            rows = np.zeros((n, n, 3))
+            rows[np.arange(n), np.arange(n), :2] = by
+            value.append(depth / self.scale)
+            slope.append(rows.reshape(n, -1))
+
+        inside = [zone.depth(ground) for zone in rules.allowed]
+        best = np.argmax([depth for depth, _ in inside], axis=0)
+        each(
+            np.array([inside[k][0][i] for i, k in enumerate(best)]),
+            np.array([inside[k][1][i] for i, k in enumerate(best)]),
+        )
+        for zone in rules.excluded:
+            depth, by = zone.depth(ground)
+            each(-depth, -by)
+        if rules.clearance_m > 0.0 and self.heliostats is not None:
+            distance, nearest = (np.asarray(a) for a in self.heliostats.query(ground))
+            offset = ground - self.heliostats.data[nearest]
+            each(distance - rules.clearance_m, offset / np.maximum(distance, 1e-12)[:, None])
+        if rules.separation_m > 0.0:
+            others = np.vstack([ground, self.existing[:, :2]])
+            i, j = np.triu_indices(len(others), 1)
+            i, j = i[i < n], j[i < n]
+            offset = others[i] - others[j]
+            distance = np.linalg.norm(offset, axis=1)
+            by = offset / np.maximum(distance, 1e-12)[:, None]
+            rows = np.zeros((len(i), n, 3))
+            rows[np.arange(len(i)), i, :2] = by
+            moving = j < n
+            rows[np.flatnonzero(moving), j[moving], :2] = -by[moving]
+            value.append((distance - rules.separation_m) / self.scale)
+            slope.append(rows.reshape(len(i), 3 * n))
+        return np.concatenate(value), np.vstack(slope)
+
+
+def _rows(
+    transmitter: FloatArray, field: Mirrors, criterion: Criterion, sigma_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Variance at each field point (point,) and its slope (point, transmitter, xyz)."""
+    n = len(field.pivot_enu_m)
+    value = np.empty(n)
+    slope = np.zeros((n, len(transmitter), 3))
+    _kernels.objective_rows(
+        CRITERIA[criterion], np.ascontiguousarray(transmitter.T), np.full(len(transmitter), sigma_m**-2.0),
+        field.receiver_mirror_m, _plane_slope(field.receiver_mirror_m), field.pivot_enu_m, field.rot_enu_from_mirror,
+        _chunks(n), value, slope,
+    )  # fmt: skip
+    return value, slope
+
+
+def _statistic(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:
+    """Rms, worst or percentile of √variance, and its slope by each variance; smooth stand-ins for the search."""
+    n = len(variance)
+    if statistic == "rms":
+        value = float(np.sqrt(variance.mean()))
+        return value, np.full(n, 0.5 / (n * value))
+    if statistic == "worst":
+        top = float(variance.max())
+        if not smooth:
+            return float(np.sqrt(top)), np.zeros(n)
+        share = (variance / top) ** _WORST_POWER
+        value = float(np.sqrt(top * share.mean() ** (1.0 / _WORST_POWER)))
+        return value, 0.5 * value * share / share.sum() / variance
+    part = float(statistic[1:]) / 100.0
+    root = np.sqrt(variance)
+    if not smooth:
+        return float(np.quantile(root, part)), np.zeros(n)
+    rank = np.empty(n)
+    rank[np.argsort(root)] = (np.arange(n) + 0.5) / n
+    weight = np.exp(-0.5 * ((rank - part) / _BAND) ** 2)
+    weight /= weight.sum()
+    return float(weight @ root), 0.5 * weight / root
+
+
+def evaluate_placement(
+    transmitter_enu_m: npt.ArrayLike,
+    field: Mirrors,
+    *,
+    criterion: Criterion = "pdop",
+    statistic: str = "rms",
+    sigma_m: float = 1.0,
+) -> float:
+    """Return rms, worst or percentile over the field of PDOP (times sigma) or of the normal's RMS angle [rad].
+
+    NaN where a point of the field is undetermined. See `optimise` for the arguments.
+    """
+    _check(criterion, statistic)
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    variance, _ = _rows(transmitter, field, criterion, sigma_m)
+    return _statistic(variance, statistic, smooth=False)[0] if np.isfinite(variance).all() else float("nan")
+
+
+def optimise(
+    n_transmitter: int,
+    field: Mirrors,
+    constraints: Constraints,
+    *,
+    criterion: Criterion = "pdop",
+    statistic: str = "rms",
+    existing_enu_m: npt.ArrayLike | None = None,
+    costs: Costs | None = None,
+    sigma_m: float = 1.0,
+    starts: int = 30,
+    seed: int = 0,
+    also_from: Sequence[npt.ArrayLike] = (),
+    progress: Progress | None = None,
+) -> Placement:
+    """Place transmitters so that a field's accuracy is best: SLSQP from many starts, gradients by the kernel.
+
+    Parameters
+    ----------
+    n_transmitter
+        All of them, existing ones included.
+    field
+        Field points: mirrors in postures; several postures of one mirror are several rows. For ``pdop`` only the
+        pivots count.
+    constraints, costs
+        See there.
+    criterion
+        ``pdop``: dilution of position. Else RMS angle of the normal: ``independent`` fits, ``rigid`` with one clock a
+        receiver, or with a ``shared-clock``; calibration perfect, noise ``sigma_m`` alike, everything in sight.
+    statistic
+        ``rms``, ``worst``, or a percentile such as ``p95``, over the field points.
+    existing_enu_m : (transmitter, xyz)
+        Towers that stand already and stay [m].
+    starts, seed
+        Random starts; the same seed gives the same result.
+    also_from
+        Further starts: positions (new transmitter, xyz) [m].
+    progress
+        Called with (starts done, starts).
+
+    Raises
+    ------
+    GeometryError
+        Fewer than five transmitters; constraints that no random try, or no search, could meet.
+    """
+    _check(criterion, statistic)
+    existing = np.empty((0, 3))
+    if existing_enu_m is not None:
+        existing = as_float_array("existing_enu_m", existing_enu_m, ("transmitter", 3))
+    n_new = n_transmitter - len(existing)
+    if n_transmitter < 5:
+        raise GeometryError(
+            f"{n_transmitter} transmitters cannot fix positions in 3 dimensions: at least 5 are needed (N >= D + 2)"
+        )
+    if n_new < 1:
+        raise GeometryError(f"{len(existing)} transmitters exist already; `n_transmitter` must be larger")
+    if starts < 1:
+        raise InvalidInputError(f"`starts` must be at least one, got {starts}")
+    ground = field.pivot_enu_m[:, :2]
+    problem = _Problem(
+        field, criterion, statistic, as_positive("sigma_m", sigma_m), existing, constraints,
+        scale=max(float(np.ptp(np.vstack([z for zone in constraints.allowed for z in zone.box]), axis=0).max()), 1e-9),
+        heliostats=KDTree(ground) if constraints.clearance_m > 0.0 else None,
+    )  # fmt: skip
+    rng = np.random.default_rng(seed)
+    begin = [as_float_array("also_from", x, (n_new, 3)) for x in also_from]
+    begin += [_draw(problem, n_new, rng) for _ in range(starts)]
+    found: list[tuple[float, FloatArray]] = []
+    value = np.full(len(begin), np.nan)
+    for k, start in enumerate(begin):
+        end = _search(problem, start)
+        if end is not None:
+            value[k] = _value(problem, end)
+            found.append((value[k], end))
+        if progress is not None:
+            progress(k + 1, len(begin))
+    found = [item for item in found if np.isfinite(item[0])]
+    if not found:
+        raise GeometryError(
+            "no search met the constraints with every field point determined; relax separation, zones or heights"
+        )
+    best = min(found, key=lambda item: item[0])[1]
+    site = problem.site(best)
+    return Placement(
+        transmitter_enu_m=read_only(site),
+        n_existing=len(existing),
+        criterion=criterion,
+        statistic=statistic,
+        value=_value(problem, best),
+        lost_one=_without_worst(problem, site),
+        cost=(costs or Costs()).of(site, len(existing)),
+        start_value=read_only(value),
+    )
+
+
+def _check(criterion: str, statistic: str) -> None:
+    if criterion not in CRITERIA:
+        raise InvalidInputError(f"`criterion` must be one of {', '.join(CRITERIA)}, got {criterion!r}")
+    if statistic in ("rms", "worst"):
+        return
+    try:
+        part = float(statistic[1:])
+    except ValueError:
+        part = np.nan
+    if not statistic.startswith("p") or not 0.0 < part < 100.0:
+        raise InvalidInputError(f"`statistic` must be rms, worst or a percentile such as p95, got {statistic!r}")
+
+
+def _draw(problem: _Problem, n_new: int, rng: np.random.Generator) -> FloatArray:
+    """Random places (new transmitter, xyz) that meet the constraints, one tower after the other."""
+    rules = problem.constraints
+    boxes = np.array([zone.box for zone in rules.allowed])
+    area = np.prod(boxes[:, 1] - boxes[:, 0], axis=1)
+    for _ in range(20):
+        placed = np.empty((0, 3))
+        for _ in range(_DRAWS):
+            low, high = boxes[rng.choice(len(boxes), p=area / area.sum())]
+            place = np.append(rng.uniform(low, high), rng.uniform(*rules.height_m))
+            trial = np.vstack([placed, place])
+            if np.all(problem.margins(trial.ravel() / problem.scale) >= 0.0):
+                placed = trial
+                if len(placed) == n_new:
+                    return placed
+    raise GeometryError(
+        f"the constraints leave no room for {n_new} new transmitters ({len(placed)} found places); relax the "
+        f"separation of {rules.separation_m:g} m, the clearance, or the zones"
+    )
+
+
+def _search(problem: _Problem, start: FloatArray) -> FloatArray | None:
+    """SLSQP from one start; None where it ends outside the constraints."""
+    n = len(start)
+    low, high = (h / problem.scale for h in problem.constraints.height_m)
+    constraint: dict[str, Any] = {"type": "ineq", "fun": problem.margins, "jac": problem.margin_slopes}
+    result = minimize(  # type: ignore[call-overload]
+        problem.objective,
+        start.ravel() / problem.scale,
+        jac=True,
+        method="SLSQP",
+        bounds=[(-np.inf, np.inf), (-np.inf, np.inf), (low, high)] * n,
+        constraints=[constraint],
+        options={"maxiter": 300, "ftol": 1e-7},
+    )
+    x = np.asarray(result.x, np.float64)
+    if not np.isfinite(x).all() or problem.margins(x).min() < -_FEASIBLE:
+        return None
+    x.reshape(-1, 3)[:, 2] = np.clip(x.reshape(-1, 3)[:, 2], low, high)
+    return x
+
+
+def _value(problem: _Problem, x: FloatArray) -> float:
+    return evaluate_placement(
+        problem.site(x),
+        problem.field,
+        criterion=problem.criterion,
+        statistic=problem.statistic,
+        sigma_m=problem.sigma_m,
+    )
+
+
+def _without_worst(problem: _Problem, site: FloatArray) -> float:
+    if len(site) <= 5:
+        return float("nan")
+    return float(
+        np.max(
+            [
+                evaluate_placement(
+                    np.delete(site, k, axis=0),
+                    problem.field,
+                    criterion=problem.criterion,
+                    statistic=problem.statistic,
+                    sigma_m=problem.sigma_m,
+                )
+                for k in range(len(site))
+            ]
+        )
+    )
+
+
+def pareto(
+    counts: Sequence[int],
+    field: Mirrors,
+    constraints: Constraints,
+    *,
+    costs: Costs | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> list[tuple[Placement, bool]]:
+    """Optimise for several numbers of transmitters; True marks those that none beats in cost, value and loss of one.
+
+    Parameters
+    ----------
+    counts
+        Numbers of transmitters.
+    field, constraints, costs, progress, **settings
+        As in `optimise`.
+    """
+    found = []
+    for k, n in enumerate(counts):
+        found.append(optimise(n, field, constraints, costs=costs, **settings))
+        if progress is not None:
+            progress(k + 1, len(counts))
+    merit = np.array([(p.cost, p.value, np.nan_to_num(p.lost_one, nan=np.inf)) for p in found])
+    beaten = [
+        any(np.all(other <= own) and np.any(other < own) for k, other in enumerate(merit) if k != i)
+        for i, own in enumerate(merit)
+    ]
+    return [(p, not b) for p, b in zip(found, beaten, strict=True)]
+
+
+def scenario_with(scenario: Scenario, transmitter_enu_m: npt.ArrayLike, *, n_existing: int = 0) -> Scenario:
+    """Return the scenario with its transmitters at other places; as TOML by ``to_toml``.
+
+    The first ``n_existing`` keep their names. Carriers are the scenario's own while they last; more transmitters
+    share the band evenly anew.
+
+    Raises
+    ------
+    ScenarioError, pydantic.ValidationError
+        The band cannot hold so many carriers.
+    """
+    place = check_site(transmitter_enu_m)
+    names = [*scenario.transmitter_ids[:n_existing]]
+    names += [f"T{k + 1}" for k in range(len(place)) if f"T{k + 1}" not in names][: len(place) - n_existing]
+    radio = scenario.radio
+    if len(place) <= len(scenario.transmitter):
+        carrier = scenario.carrier_hz[: len(place)]
+    else:
+        half = 0.5 * radio.sample_rate_hz
+        margin = radio.clock_search_ppm * 1e-6 * (radio.centre_frequency_hz + half)
+        usable = half - margin - float(scenario.tone_hz.max())
+        carrier = np.linspace(-1.0, 1.0, len(place)) * usable * len(place) / (len(place) + 1.0)
+    amplitude = [t.amplitude for t in scenario.transmitter]
+    amplitude += [1.0] * len(place)
+    new = tuple(
+        Transmitter(id=name, position_enu_m=tuple(map(float, p)), carrier_hz=float(f), amplitude=a)
+        for name, p, f, a in zip(names, place, carrier, amplitude, strict=False)
+    )
+    # not model_copy: it would neither check the new transmitters nor drop the arrays made of the old ones
+    data = scenario.model_dump(exclude_none=True)
+    data["transmitter"] = [t.model_dump() for t in new]
+    kept = {t.id for t in new}
+    blocked = data.get("simulation", {}).get("blocked", ())
+    if blocked:
+        data["simulation"]["blocked"] = [b for b in blocked if b["transmitter"] in kept]
+    return Scenario.model_validate(data)

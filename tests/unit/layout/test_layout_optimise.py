@@ -1,0 +1,105 @@
+"""Placement under constraints, and what is refused."""
+
+import numpy as np
+import pytest
+
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.layout.maps import check_site, disc_points, mirrors_facing
+from rfpose.layout.optimise import Constraints, Costs, Zone, evaluate_placement, optimise, pareto
+
+TRIANGLE = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
+FIELD = mirrors_facing(disc_points(100), TRIANGLE, normal_enu=[0.0, -0.5, 1.0])
+DISC = Constraints(allowed=(Zone(radius_m=1.0),), height_m=(0.2, 0.5))
+
+
+@pytest.mark.parametrize("statistic", ["rms", "worst", "p90"])
+def test_search_improves_and_repeats(statistic):
+    first = optimise(6, FIELD, DISC, statistic=statistic, starts=3, seed=4)
+    again = optimise(6, FIELD, DISC, statistic=statistic, starts=3, seed=4)
+    np.testing.assert_array_equal(first.transmitter_enu_m, again.transmitter_enu_m)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        near = first.transmitter_enu_m + rng.normal(0.0, 0.05, (6, 3))
+        near[:, :2] /= np.maximum(1.0, np.linalg.norm(near[:, :2], axis=1))[:, None]
+        near[:, 2] = np.clip(near[:, 2], 0.2, 0.5)
+        assert evaluate_placement(near, FIELD, statistic=statistic) > first.value * 0.999
+    assert first.value == pytest.approx(evaluate_placement(first.transmitter_enu_m, FIELD, statistic=statistic))
+    assert first.lost_one > first.value
+
+
+def test_every_constraint_is_met():
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    rules = Constraints(
+        allowed=(Zone(corner_enu_m=square), Zone(centre_enu_m=(2.0, 0.0), radius_m=0.3)),
+        excluded=(Zone(radius_m=0.5),),
+        height_m=(0.2, 0.5),
+        separation_m=0.4,
+        clearance_m=0.02,
+    )
+    standing = [[0.0, 0.0, 0.6], [0.9, 0.9, 0.4]]
+    best = optimise(7, FIELD, rules, existing_enu_m=standing, starts=3, seed=1)
+    np.testing.assert_array_equal(best.transmitter_enu_m[:2], standing)
+    new = best.transmitter_enu_m[2:]
+    inside = (np.abs(new[:, :2]) <= 1.0 + 1e-5).all(axis=1)
+    assert (inside | (np.linalg.norm(new[:, :2] - [2.0, 0.0], axis=1) <= 0.3 + 1e-5)).all()
+    assert (np.linalg.norm(new[:, :2], axis=1) >= 0.5 - 1e-5).all()
+    assert (new[:, 2] >= 0.2).all()
+    assert (new[:, 2] <= 0.5).all()
+    apart = np.linalg.norm(best.transmitter_enu_m[:, None, :2] - best.transmitter_enu_m[:, :2], axis=2)
+    assert apart[~np.eye(7, dtype=bool)].min() >= 0.4 - 1e-5
+    gap = np.linalg.norm(new[:, None, :2] - FIELD.pivot_enu_m[:, :2], axis=2)
+    assert gap.min() >= 0.02 - 1e-5
+
+
+def test_zone_depth_and_its_slope():
+    arrow = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0]])
+    zone = Zone(corner_enu_m=arrow)
+    point = np.array([[2.0, 0.4], [3.9, 2.0], [1.0, 3.0], [-1.0, -1.0]])
+    depth, slope = zone.depth(point)
+    assert depth == pytest.approx([0.4, 0.1, -7.0 / np.sqrt(13.0), -np.sqrt(2.0)])
+    step = np.array([1e-6, 2e-6])
+    np.testing.assert_allclose(zone.depth(point + step)[0] - depth, slope @ step, atol=1e-11)
+
+
+def test_costs_count_new_towers_height_and_cable():
+    site = np.array([[0.0, 1.0, 2.0], [3.0, 1.0, 4.0], [3.0, 5.0, 6.0]])
+    costs = Costs(per_tower=100.0, per_height_m=10.0, per_cable_m=1.0)
+    assert costs.of(site) == pytest.approx(300.0 + 120.0 + (1.0 + 3.0 + 4.0))
+    assert costs.of(site, 1) == pytest.approx(200.0 + 100.0 + (3.0 + 4.0))
+
+
+def test_more_transmitters_are_dearer_and_better():
+    found = pareto([5, 6, 8], FIELD, DISC, costs=Costs(per_tower=2.0), starts=2)
+    value = [placement.value for placement, _ in found]
+    assert value == sorted(value, reverse=True)
+    assert [placement.cost for placement, _ in found] == [10.0, 12.0, 16.0]
+    assert all(free for _, free in found)
+
+
+@pytest.mark.parametrize(
+    ("rules", "n", "error", "text"),
+    [
+        (Constraints(allowed=(Zone(radius_m=1.0),), height_m=(0.2, 0.5), separation_m=1.5), 10, GeometryError, "room"),
+        (DISC, 4, GeometryError, "at least 5"),
+    ],
+)
+def test_what_cannot_be_met_is_refused(rules, n, error, text):
+    with pytest.raises(error, match=text):
+        optimise(n, FIELD, rules, starts=1)
+
+
+def test_unknown_statistic_is_refused():
+    with pytest.raises(InvalidInputError, match="percentile"):
+        optimise(6, FIELD, DISC, statistic="mean")
+
+
+def test_broken_guidelines_are_named():
+    ring = np.array([[np.cos(a), np.sin(a), 0.0] for a in range(6)])
+    with pytest.raises(GeometryError, match=r"N >= D \+ 2"):
+        check_site(ring[:4])
+    with pytest.raises(GeometryError, match=r"one plane.*0\.000, 0\.000, 1\.000"):
+        check_site(ring)
+    with pytest.raises(GeometryError, match="one line"):
+        check_site(np.outer(np.arange(6.0), [1.0, 2.0, 0.5]))
+    with pytest.raises(GeometryError, match="same place"):
+        check_site(np.vstack([ring, ring[2]]) + np.outer(np.arange(7) == 1, [0.0, 0.0, 1.0]))
