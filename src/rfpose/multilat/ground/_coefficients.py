@@ -18,6 +18,8 @@ _MAX_STEP = 0.2
 _MAX_ROUND = 25
 _MAX_HALVING = 6
 _MAX_ITERATION_TRIED = 8
+_FAR_WORSE = 20.0
+"""times the chi² of a mirror that fits well. False minima are worse by thousands."""
 _FITS = 2.0
 """chi² over degrees of freedom of the middle mirror that leaves nothing to search for."""
 
@@ -49,8 +51,11 @@ def find(problem: Problem, state: State, turn: FloatArray) -> FloatArray:
     for key in sorted(tried, key=tried.__getitem__)[:_N_REFINED]:
         candidate, trial = np.array(key), start.copy()
         few.fit(trial, candidate)
-        retry(few, start, trial, candidate, turn)
-        refined = refine(few, trial, candidate)
+        refined = candidate
+        for _ in range(2):
+            # the second time with coefficients that tell right poses from wrong ones
+            retry(few, start, trial, refined, turn)
+            refined = refine(few, trial, refined)
         cost = _cost(few, trial)
         if cost < best_cost:
             best, best_cost = refined, cost
@@ -118,8 +123,8 @@ def _usual(problem: Problem, state: State) -> FloatArray:
     """(mirror,) largest chi² over degrees of freedom that is not out of the ordinary."""
     dof = np.maximum(problem.dof, 1.0)
     solved = state.status == 0
-    middle = float(np.median((state.chi2 / dof)[solved])) if np.any(solved) else 1.0
-    return np.asarray(np.maximum(5.0 * middle, 1.0 + 6.0 * np.sqrt(2.0 / dof)))
+    good = float(np.quantile((state.chi2 / dof)[solved], 0.1)) if np.any(solved) else 1.0
+    return np.asarray(np.maximum(_FAR_WORSE * good, 1.0 + 6.0 * np.sqrt(2.0 / dof)))
 
 
 def _score(problem: Problem, start: State, parameter: FloatArray) -> float:

@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc
+from scipy.stats import qmc
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
@@ -36,8 +37,10 @@ __all__ = ["GroundSolution", "GroundStatus", "solve_with_ground"]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-_TILTS_RAD = (0.06, 0.12, 0.2, 0.3)
-"""How far a mirror that does not fit is turned to start again."""
+_TURN_RAD = 0.4
+"""How far a mirror that does not fit is turned at most to start again."""
+_N_TURN = 200
+"""Points in a cube, of which half lie in the ball."""
 _MAX_ITERATION_DIRECT = 12
 
 
@@ -200,8 +203,11 @@ def solve_with_ground(
         finest, _ = lay_out(len(observations), [o.range_m for o in observations], state.pivot, state.rot)
         predicted, slope = finest.predict(state, parameter)
         cov = _joint_covariance(state, _coefficient_cov(problem, state))
+        # a pose that does not explain its tones predicts no carrier
+        sound = ~(_probability(state.chi2, problem.dof, state.status == GroundStatus.OK) < min_probability)
         for k in range(n_tone, len(observations)):
             resolved, risk[:, k] = resolve(observations[k], predicted[:, k], (slope[:, k], cov), known)
+            risk[~sound, k] = 1.0
             ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
         problem, clock = lay_out(len(observations), ranges, state.pivot, state.rot)
         state = State.begin(state.pivot, state.rot, clock, state.status, problem.n_parameter)
@@ -265,10 +271,11 @@ def _behind(places: FloatArray, pivot: FloatArray, rot: FloatArray, reflectors: 
 
 
 def _turns() -> FloatArray:
-    """Rotation vectors about the mirror's x and y axes, small ones first; none at all is first of all."""
-    around = np.arange(8) * (np.pi / 4.0)
-    ring = np.stack([np.cos(around), np.sin(around), np.zeros(8)], axis=1)
-    return np.concatenate([NO_TURN, *(tilt * ring for tilt in _TILTS_RAD)])
+    """Rotation vectors spread over a ball, small ones first; none at all is first of all."""
+    cube = 2.0 * qmc.Halton(3, scramble=False).random(_N_TURN) - 1.0
+    length = np.linalg.norm(cube, axis=1)
+    inside = length <= 1.0
+    return np.concatenate([NO_TURN, _TURN_RAD * cube[inside][np.argsort(length[inside])]])
 
 
 def _direct_probability(problem: Problem, start: State) -> FloatArray:
