@@ -12,7 +12,7 @@ from rfpose.cli.evaluate import show_evaluation
 __all__ = ["command"]
 
 
-@click.command(name="demo", epilog=examples("rfpose demo", "rfpose demo -o /tmp/field --seed 3 --json"))
+@click.command(name="demo", epilog=examples("rfpose demo", "rfpose demo -o field --seed 3 --json"))
 @click.option(
     "-o",
     "--output",
