@@ -6,5 +6,13 @@ from rfpose.multilat.integrity.exclusion import (
     TransmitterStatus,
     solve_with_integrity,
 )
+from rfpose.multilat.integrity.robust import RobustFixes, locate_robust
 
-__all__ = ["GuardedPoses", "IntegrityStatus", "TransmitterStatus", "solve_with_integrity"]
+__all__ = [
+    "GuardedPoses",
+    "IntegrityStatus",
+    "RobustFixes",
+    "TransmitterStatus",
+    "locate_robust",
+    "solve_with_integrity",
+]

@@ -156,7 +156,7 @@ def solve_with_integrity(
     knowledge: Knowledge | None = None,
     false_alarm: float = 1e-2,
     missed_detection: float = 1e-3,
-    max_excluded: int = 3,
+    max_excluded: int = 4,
 ) -> GuardedPoses:
     """Solve rigid poses, leave out what contradicts the rest, and bound what could be wrong unnoticed.
 
