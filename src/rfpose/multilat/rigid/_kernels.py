@@ -352,7 +352,7 @@ def solve_many(
 
 
 @kernel_parallel
-def bound_many(
+def covariance_many(
     transmitter,
     receiver_mirror,
     weight,
@@ -366,21 +366,19 @@ def bound_many(
     pivot,
     rot,
     cov,
-    ok,
 ):
-    """Covariance of pivot and rotation that the observations allow, at the given poses."""
+    """Covariance (unknown, unknown) of all unknowns at the given poses; rows that are not determined stay as given."""
     n_receiver = receiver_mirror.shape[1]
-    n_transmitter = transmitter.shape[0]
     n_class = clock_own.shape[1]
     n = 6 + n_class * n_receiver
     for m in numba.prange(weight.shape[0]):
-        distance = np.empty((n_receiver, n_transmitter))
-        slope = np.empty((n_receiver, n_transmitter, 6))
+        distance = np.empty((n_receiver, transmitter.shape[0]))
+        slope = np.empty((n_receiver, transmitter.shape[0], 6))
         info = np.zeros((n, n))
-        gradient = np.zeros(n)
+        unused = np.zeros(n)
         clock = np.zeros((n_class, n_receiver))
         ranges_and_slopes(transmitter, receiver_mirror[m], pivot[m], rot[m], distance, slope)
-        normal_equations(weight[m], weight[m], bias_info[m], clock_class, distance, slope, clock, info, gradient)
+        normal_equations(weight[m], weight[m], bias_info[m], clock_class, distance, slope, clock, info, unused)
         add_priors(
             pivot[m],
             rot[m],
@@ -392,8 +390,11 @@ def bound_many(
             clock_tie[m],
             clock,
             info,
-            gradient,
+            unused,
         )
-        ok[m] = factor(info, floor)
-        if ok[m]:
-            pose_covariance(info, cov[m])
+        if factor(info, floor):
+            for a in range(n):
+                column = np.zeros(n)
+                column[a] = 1.0
+                solve_factored(info, column)
+                cov[m, a] = column

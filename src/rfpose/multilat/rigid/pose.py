@@ -18,7 +18,7 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat.rigid import _kernels
 
-__all__ = ["Knowledge", "RigidPoses", "RigidStatus", "rigid_bound", "solve_rigid"]
+__all__ = ["Knowledge", "RigidPoses", "RigidStatus", "full_covariance", "rigid_bound", "solve_rigid", "tilt_sigma_rad"]
 
 _MAX_ITERATION = 40
 _FLOOR = 1e-13
@@ -247,6 +247,44 @@ def rigid_bound(
     (mirror, 6, 6)
         NaN where the pose is not determined. `tilt_sigma_rad` makes the normal's rms angle of it.
     """
+    full = full_covariance(
+        transmitter_enu_m,
+        receiver_mirror_m,
+        pivot_enu_m,
+        rot_enu_from_mirror,
+        sigma_m=sigma_m,
+        transmitter_sigma_m=transmitter_sigma_m,
+        clock_class=clock_class,
+        knowledge=knowledge,
+    )
+    return full[:, :6, :6]
+
+
+def full_covariance(
+    transmitter_enu_m: npt.ArrayLike,
+    receiver_mirror_m: npt.ArrayLike,
+    pivot_enu_m: npt.ArrayLike,
+    rot_enu_from_mirror: npt.ArrayLike,
+    *,
+    sigma_m: npt.ArrayLike,
+    transmitter_sigma_m: npt.ArrayLike,
+    clock_class: npt.ArrayLike,
+    knowledge: Knowledge | None = None,
+) -> FloatArray:
+    """Return the covariance of pivot [m], rotation [rad] and every clock [m], at the given poses.
+
+    Parameters
+    ----------
+    transmitter_enu_m, receiver_mirror_m, pivot_enu_m, rot_enu_from_mirror, sigma_m, transmitter_sigma_m, clock_class
+        As in `rigid_bound`.
+    knowledge
+        As in `solve_rigid`.
+
+    Returns
+    -------
+    (mirror, unknown, unknown)
+        Order: pivot, rotation, then clocks by class and receiver. NaN where the pose is not determined.
+    """
     known = knowledge or Knowledge()
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
     sigma = as_float_array("sigma_m", sigma_m, ("mirror", "group", "receiver", "transmitter"), finite=False)
@@ -257,10 +295,10 @@ def rigid_bound(
     n_class = int(classes.max()) + 1
     bias_info = _bias_info(transmitter_sigma_m, (n_mirror, n_group, n_transmitter))
     _, pivot_info = _pivot_prior(known, n_mirror)
-    cov = np.full((n_mirror, 6, 6), np.nan)
-    ok = np.zeros(n_mirror, np.bool_)
+    n_unknown = 6 + n_class * n_receiver
+    cov = np.full((n_mirror, n_unknown, n_unknown), np.nan)
     own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
-    _kernels.bound_many(
+    _kernels.covariance_many(
         transmitter,
         places,
         weight,
@@ -274,7 +312,6 @@ def rigid_bound(
         np.array(np.broadcast_to(np.asarray(pivot_enu_m, np.float64), (n_mirror, 3))),
         np.array(np.broadcast_to(np.asarray(rot_enu_from_mirror, np.float64), (n_mirror, 3, 3))),
         cov,
-        ok,
     )
     return cov
 
