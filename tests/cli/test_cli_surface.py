@@ -35,9 +35,18 @@ def test_help_loads_nothing_heavy() -> None:
         assert name in done.stdout
 
 
-@pytest.mark.parametrize("name", _app.COMMANDS)
+def _words() -> list[str]:
+    """Every command as typed; a group's sub-commands instead of the group."""
+    out = []
+    for name in _app.COMMANDS:
+        command = importlib.import_module(f"rfpose.cli.{name}").command
+        out += [f"{name} {sub}" for sub in command.commands] if isinstance(command, click.Group) else [name]
+    return out
+
+
+@pytest.mark.parametrize("name", _words())
 def test_each_command_has_help_with_examples(name: str) -> None:
-    shown = CliRunner().invoke(_app.app, [name, "--help"])
+    shown = CliRunner().invoke(_app.app, [*name.split(), "--help"])
     assert shown.exit_code == 0
     assert f"  rfpose {name}" in shown.output
     assert "--json" in shown.output
