@@ -175,9 +175,10 @@ def test_a_transmitters_own_error_is_harmless_between_receivers():
     np.testing.assert_allclose(after.protection_level_rad, before.protection_level_rad, rtol=1e-6)
 
 
-def test_a_pivot_one_metre_off_is_rejected_not_averaged():
+@pytest.mark.parametrize("off_m", [0.1, 1.0])
+def test_a_pivot_that_is_off_is_rejected_not_averaged(off_m):
     survey = PIVOT.copy()
-    survey[1, 0] += 1.0
+    survey[1, 0] += off_m
     known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=survey, pivot_sigma_m=5e-3)
     z = measure(7)
     found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(known))
