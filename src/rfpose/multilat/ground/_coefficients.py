@@ -8,16 +8,21 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.ground._problem import Problem, State
 
-__all__ = ["find", "information", "refine", "retry", "trusted"]
+__all__ = ["MAX_CONDITION", "find", "information", "refine", "retry", "trusted"]
 
 BoolArray = npt.NDArray[np.bool_]
 
 _N_SUBSET = 24
 _N_REFINED = 3
 _MAX_STEP = 0.2
+MAX_CONDITION = 1e12
+"""Of the coefficients' information; beyond it they are not determined."""
 _MAX_ROUND = 25
 _MAX_HALVING = 6
 _MAX_ITERATION_TRIED = 8
+_MAX_ITERATION_RETRY = 15
+_MOST_FITS = 1500
+_FEWEST_TURNS = 6
 _FAR_WORSE = 20.0
 """times the chi² of a mirror that fits well. False minima are worse by thousands."""
 _FITS = 2.0
@@ -71,7 +76,7 @@ def refine(problem: Problem, state: State, parameter: FloatArray) -> FloatArray:
     for _ in range(_MAX_ROUND):
         good = trusted(problem, state)
         total, rest = information(state, good), state.rest[good].sum(axis=0)
-        if not np.any(good) or np.linalg.cond(total) > 1e12:
+        if not np.any(good) or np.linalg.cond(total) > MAX_CONDITION:
             break
         step = np.linalg.solve(total, rest)
         share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))
@@ -104,7 +109,10 @@ def retry(problem: Problem, start: State, state: State, parameter: FloatArray, t
     if not len(rows):
         return
     again = start.take(rows)
-    problem.take(rows).fit(again, parameter, turn=turn, enough=(usual * np.maximum(problem.dof, 1.0))[rows])
+    # where the model itself is wrong nothing fits: what is spent on it stays bounded
+    affordable = turn[: max(_FEWEST_TURNS, _MOST_FITS // len(rows))]
+    enough = (usual * np.maximum(problem.dof, 1.0))[rows]
+    problem.take(rows).fit(again, parameter, turn=affordable, enough=enough, max_iteration=_MAX_ITERATION_RETRY)
     better = np.flatnonzero((again.status == 0) & (again.chi2 < state.chi2[rows]))
     state.put(rows[better], again.take(better))
 

@@ -21,7 +21,8 @@ def resolve(
     predicted: FloatArray,
     uncertainty: float | tuple[FloatArray, FloatArray],
     known: Knowledge,
-) -> tuple[FloatArray, FloatArray]:
+    offset_m: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Round ranges to the wavelength nearest to the prediction.
 
     Without calibration only differences to a transmitter's first receiver mean anything; with a clock for each
@@ -37,6 +38,8 @@ def resolve(
         the covariance (mirror, k, k) of what it was made of.
     known
         For the clocks.
+    offset_m : (mirror, receiver, 1), optional
+        Receivers' common offsets as a coarser tone gave them: the same clock moves both.
 
     Returns
     -------
@@ -44,6 +47,8 @@ def resolve(
         [m].
     wrong_risk : (mirror,)
         Probability that any is wrong (a bound: the sum of them all); 1 where it cannot be judged.
+    offset_m : (mirror, receiver, 1)
+        Common offset of each receiver; zero where clocks leave none.
     """
     seen = np.isfinite(observation.range_m)
     left = observation.range_m - predicted
@@ -65,8 +70,12 @@ def resolve(
         variance = noise + _variance(*uncertainty, seen, reference, offset_free)
     sigma = np.sqrt(variance)
     risk = np.zeros(len(left))
+    offset = np.zeros((*left.shape[:2], 1))
     if offset_free:
         offset, offset_risk = common_offset(left, observation.wavelength_m, sigma)
+        if offset_m is not None:
+            longest = float(np.max(observation.wavelength_m))
+            offset = offset + np.rint((offset_m - offset) / longest) * longest
         left = left - offset
         risk = np.where(seen.any(axis=2), offset_risk, 0.0).sum(axis=1)
     turns = np.rint(left / observation.wavelength_m)
@@ -74,7 +83,7 @@ def resolve(
         wrong = erfc(0.5 * observation.wavelength_m / (np.sqrt(2.0) * sigma))
     risk = np.minimum(risk + np.where(seen, wrong, 0.0).sum(axis=(1, 2)), 1.0)
     risk = np.where(seen.any(axis=(1, 2)) & np.isfinite(risk), risk, 1.0)
-    return observation.range_m - turns * observation.wavelength_m, risk
+    return observation.range_m - turns * observation.wavelength_m, risk, offset
 
 
 def _variance(

@@ -19,6 +19,7 @@ from scipy.stats import qmc
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.ground import _coefficients
+from rfpose.multilat.ground._coefficients import MAX_CONDITION
 from rfpose.multilat.ground._problem import NO_TURN, Problem, State, build
 from rfpose.multilat.ground.integers import resolve
 from rfpose.multilat.ground.model import (
@@ -30,7 +31,7 @@ from rfpose.multilat.ground.model import (
     heights_m,
 )
 from rfpose.multilat.rigid.integers import Observation
-from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, _places
+from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, _places
 
 __all__ = ["GroundSolution", "GroundStatus", "solve_with_ground"]
 
@@ -42,6 +43,8 @@ _TURN_RAD = 0.4
 _N_TURN = 200
 """Points in a cube, of which half lie in the ball."""
 _MAX_ITERATION_DIRECT = 12
+_RIGID_STATUS = np.array([0, 1, 2, 3, 4, RigidStatus.NO_START, RigidStatus.OK], np.int64)
+"""`RigidStatus` of each `GroundStatus`."""
 
 
 class GroundStatus(IntEnum):
@@ -186,8 +189,9 @@ def solve_with_ground(
     risk = np.ones((n_mirror, len(observations)))
     distance = np.linalg.norm(_receivers(places, pivot, rot)[:, :, None] - transmitter, axis=-1)
     ranges = []
+    offset = None
     for k in range(n_tone):
-        resolved, risk[:, k] = resolve(observations[k], distance, float(start_sigma_m), known)
+        resolved, risk[:, k], offset = resolve(observations[k], distance, float(start_sigma_m), known, offset)
         ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
     problem, clock = lay_out(n_tone, ranges, pivot, rot)
     status[(status == GroundStatus.OK) & (problem.dof < 0)] = GroundStatus.TOO_FEW
@@ -206,7 +210,7 @@ def solve_with_ground(
         # a pose that does not explain its tones predicts no carrier
         sound = ~(_probability(state.chi2, problem.dof, state.status == GroundStatus.OK) < min_probability)
         for k in range(n_tone, len(observations)):
-            resolved, risk[:, k] = resolve(observations[k], predicted[:, k], (slope[:, k], cov), known)
+            resolved, risk[:, k], _ = resolve(observations[k], predicted[:, k], (slope[:, k], cov), known)
             risk[~sound, k] = 1.0
             ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
         problem, clock = lay_out(len(observations), ranges, state.pivot, state.rot)
@@ -292,10 +296,10 @@ def _probability(chi2: FloatArray, dof: FloatArray, solved: BoolArray) -> FloatA
 
 
 def _coefficient_cov(problem: Problem, state: State) -> FloatArray:
-    """Covariance of the coefficients; infinite where the mirrors do not determine them."""
+    """Covariance of the coefficients; NaN where the mirrors do not determine them."""
     information = _coefficients.information(state, _coefficients.trusted(problem, state))
-    if not np.any(information) and information.size:
-        return np.full(information.shape, np.inf)
+    if information.size and not (np.any(information) and np.linalg.cond(information) < MAX_CONDITION):
+        return np.full(information.shape, np.nan)
     return np.asarray(np.linalg.inv(information))
 
 
@@ -327,6 +331,8 @@ def _solution(
     status[(status == GroundStatus.OK) & _behind(places, state.pivot, state.rot, reflectors)] = (
         GroundStatus.BEHIND_REFLECTOR
     )
+    if np.any(np.isnan(coefficient_cov)):
+        status[status == GroundStatus.OK] = GroundStatus.SINGULAR
     solved = status == GroundStatus.OK
     # each mirror pays its share of the coefficients
     dof = problem.dof - np.einsum("mab,ba->m", state.schur, coefficient_cov)
@@ -345,7 +351,7 @@ def _solution(
             chi2=chi2,
             dof=dof,
             n_iteration=state.n_iteration,
-            status=np.where(state.status <= GroundStatus.TOO_FEW, state.status, GroundStatus.NO_START),
+            status=_RIGID_STATUS[status],
         ),
         coefficient=problem.scene_at(parameter).coefficient,
         coefficient_cov=coefficient_cov,
