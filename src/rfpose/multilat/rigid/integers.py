@@ -106,7 +106,6 @@ def solve_ladder(
     *,
     start_pivot_enu_m: npt.ArrayLike,
     start_rot_enu_from_mirror: npt.ArrayLike,
-    start_sigma_m: npt.ArrayLike | None = None,
     knowledge: Knowledge | None = None,
     wrong_risk: float = 1e-6,
 ) -> RigidSolution:
@@ -119,11 +118,9 @@ def solve_ladder(
     receiver_mirror_m : (mirror, receiver, xyz)
         From the pivot, in the mirror frame [m].
     observations
-        Coarsest first; the first one's integers must be resolved already unless ``start_sigma_m`` is given.
+        Coarsest first; the first one's integers must be resolved already.
     start_pivot_enu_m, start_rot_enu_from_mirror : (mirror, xyz), (mirror, 3, 3)
         Where to begin.
-    start_sigma_m : (mirror,), optional
-        Uncertainty of the start's receiver positions [m], when even the first observation must be resolved from it.
     knowledge
         Clocks, pivot, mount.
     wrong_risk
@@ -146,7 +143,7 @@ def solve_ladder(
     resolved = [np.full(o.range_m.shape, np.nan) for o in observations]
     poses: RigidPoses | None = None
     for k, observation in enumerate(observations):
-        if poses is None and start_sigma_m is None:
+        if poses is None:
             resolved[k] = observation.range_m
             fixed[:, k], risk[:, k] = True, 0.0
         else:
@@ -155,9 +152,6 @@ def solve_ladder(
                 transmitter,
                 places,
                 poses,
-                np.asarray(start_pivot_enu_m, np.float64),
-                np.asarray(start_rot_enu_from_mirror, np.float64),
-                None if start_sigma_m is None else np.broadcast_to(start_sigma_m, (n_mirror,)),
                 knowledge or Knowledge(),
             )
             safe: BoolArray = np.less_equal(risk[:, k], wrong_risk)
@@ -209,17 +203,12 @@ def _resolve(
     observation: Observation,
     transmitter: FloatArray,
     places: FloatArray,
-    poses: RigidPoses | None,
-    start_pivot: FloatArray,
-    start_rot: FloatArray,
-    start_sigma: FloatArray | None,
+    poses: RigidPoses,
     known: Knowledge,
 ) -> tuple[FloatArray, FloatArray]:
     """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
-    pivot = start_pivot if poses is None else _or(poses.pivot_enu_m, start_pivot)
-    rot = start_rot if poses is None else _or(poses.rot_enu_from_mirror, start_rot)
-    arm = np.einsum("mab,mrb->mra", rot, places)
-    to_receiver = (pivot[:, None] + arm)[:, :, None] - transmitter
+    arm = np.einsum("mab,mrb->mra", poses.rot_enu_from_mirror, places)
+    to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - transmitter
     distance = np.linalg.norm(to_receiver, axis=-1)
     direction = to_receiver / distance[..., None]
     slope = np.concatenate([direction, np.cross(arm[:, :, None], direction)], axis=-1)
@@ -239,12 +228,7 @@ def _resolve(
         offset_free = not np.isfinite(known.clock_sigma_m)
         slope = centred - centred[:, :1] if offset_free else slope - slope[:, :1]
         noise = noise if offset_free else noise + 2.0 * known.clock_sigma_m**2
-    predicted = np.full(left.shape, np.nan)
-    if start_sigma is not None:
-        predicted[:] = (start_sigma**2)[:, None, None]
-    if poses is not None:
-        from_pose = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
-        predicted = np.where(np.isfinite(from_pose), from_pose, predicted)
+    predicted = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
     sigma = np.sqrt(predicted + noise)
     offset_risk = np.zeros(left.shape[:2])
     if offset_free:
