@@ -1,0 +1,44 @@
+"""A site as data: transmitters, tones, heliostats, receivers, and how to simulate them.
+
+A scenario is a TOML file; `load_scenario` turns it into frozen records and refuses unknown keys and
+contradictions. Every length is metres in the site ENU frame unless a name says otherwise.
+"""
+
+from __future__ import annotations
+
+from rfpose.scenario._reading import load_scenario, parse_scenario
+from rfpose.scenario._scenario import Receiver, Scenario
+from rfpose.scenario.records import (
+    MAX_FRAME_SAMPLES,
+    MIN_FRAME_SAMPLES,
+    SPEED_OF_LIGHT_MPS,
+    CalibrationReceiver,
+    Heliostat,
+    Mirror,
+    Radio,
+    Site,
+    Tone,
+    Transmitter,
+)
+from rfpose.scenario.simulation import Blockage, Dropout, Ground, Simulation
+
+__all__ = [
+    "MAX_FRAME_SAMPLES",
+    "MIN_FRAME_SAMPLES",
+    "SPEED_OF_LIGHT_MPS",
+    "Blockage",
+    "CalibrationReceiver",
+    "Dropout",
+    "Ground",
+    "Heliostat",
+    "Mirror",
+    "Radio",
+    "Receiver",
+    "Scenario",
+    "Simulation",
+    "Site",
+    "Tone",
+    "Transmitter",
+    "load_scenario",
+    "parse_scenario",
+]

@@ -1,0 +1,95 @@
+"""TOML in, a checked scenario out, or one line that names the key and the remedy."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from rfpose.errors import ScenarioError
+from rfpose.scenario._scenario import Scenario
+from rfpose.scenario.records import Mirror
+
+
+def load_scenario(path: str | Path, *, scale: float | None = None) -> Scenario:
+    """Read and check a scenario file.
+
+    Parameters
+    ----------
+    path
+        A TOML file as described in ``docs/scenario.md``.
+    scale
+        Overrides the file's ``scale`` key: every length and tone wavelength is multiplied by it.
+
+    Raises
+    ------
+    ScenarioError
+        The file is missing, is not TOML, has unknown or mistyped keys, or contradicts itself. The message
+        names the file, the key and the remedy.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot read the scenario: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: not a text file; a scenario is TOML in UTF-8") from error
+    return parse_scenario(text, source=str(path), scale=scale)
+
+
+def parse_scenario(text: str, *, source: str = "scenario", scale: float | None = None) -> Scenario:
+    """Check a scenario given as TOML text; see `load_scenario`. ``source`` names it in messages."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source}: not valid TOML: {error}") from error
+    try:
+        file_scale = data.pop("scale", 1.0)
+        if not isinstance(file_scale, int | float) or isinstance(file_scale, bool):
+            raise ScenarioError(f"`scale` must be a number, got {file_scale!r}")
+        _fill_heliostats(data)
+        scenario = Scenario.model_validate(data)
+        return scenario.scaled(float(file_scale if scale is None else scale))
+    except ValidationError as error:
+        raise ScenarioError(f"{source}: {_in_words(error)}") from error
+    except ScenarioError as error:
+        raise ScenarioError(f"{source}: {error}") from error
+
+
+def _fill_heliostats(data: dict[str, Any]) -> None:
+    """Give each heliostat what the ``[mirror]`` table says unless it says so itself, and names its receivers."""
+    mirror = Mirror.model_validate(data.pop("mirror", {})).model_dump(exclude_none=True)
+    heliostats = data.get("heliostat", [])
+    if not isinstance(heliostats, list):
+        return
+    for heliostat in heliostats:
+        if not isinstance(heliostat, dict):
+            continue
+        for key, value in mirror.items():
+            heliostat.setdefault(key, value)
+        places = heliostat.get("receiver_mirror_m")
+        if isinstance(places, list | tuple) and "id" in heliostat:
+            heliostat.setdefault("receiver_ids", [f"{heliostat['id']}_r{k}" for k in range(len(places))])
+
+
+def _in_words(error: ValidationError) -> str:
+    """Put pydantic's first complaint as ``place: what is wrong``."""
+    complaints = error.errors()
+    # a misspelt key is also a missing one; the misspelling is the better message
+    first = min(complaints, key=lambda c: c["type"] != "extra_forbidden")
+    place = ""
+    for part in first["loc"]:
+        place += f"[{part}]" if isinstance(part, int) else f".{part}" if place else str(part)
+    if first["type"] == "extra_forbidden":
+        text = f"unknown key `{place}`; remove it or correct its spelling"
+    elif first["type"] == "missing":
+        text = f"`{place}` is missing"
+    elif first["type"] == "value_error":
+        reason = first["msg"].removeprefix("Value error, ")
+        text = f"`{place}`: {reason}" if place else reason
+    else:
+        text = f"`{place}` {first['msg'][:1].lower()}{first['msg'][1:]}, got {str(first['input'])[:80]}"
+    more = len(complaints) - 1
+    return text + (f" (and {more} more)" if more else "")

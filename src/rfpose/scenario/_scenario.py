@@ -1,0 +1,154 @@
+"""The whole site: records, the arrays made of them, and scaling."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+import tomli_w
+from pydantic import Field, model_validator
+
+from rfpose.checks import FloatArray, read_only
+from rfpose.errors import ScenarioError
+from rfpose.scenario._consistency import CHECKS
+from rfpose.scenario._scaling import scale_lengths
+from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
+from rfpose.scenario.simulation import Simulation
+
+
+class Receiver(NamedTuple):
+    """One row of the receiver axis: where it belongs. Calibration receivers have no heliostat."""
+
+    id: str
+    heliostat: int | None
+    calibration: int | None
+    oscillator: str
+
+
+class Scenario(Record):
+    """A whole site. Load one with `load_scenario`; array properties are read-only.
+
+    The receiver axis holds every heliostat's receivers in order, then the calibration receivers.
+    """
+
+    name: str
+    site: Site = Site()
+    radio: Radio
+    tone: Annotated[tuple[Tone, ...], Field(min_length=1)]
+    transmitter: Annotated[tuple[Transmitter, ...], Field(min_length=1)]
+    calibration_receiver: tuple[CalibrationReceiver, ...] = ()
+    heliostat: tuple[Heliostat, ...] = ()
+    simulation: Simulation = Simulation()
+
+    def __eq__(self, other: object) -> bool:
+        # not pydantic's own comparison, which trips over the cached arrays
+        return isinstance(other, Scenario) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash(self.to_toml())
+
+    # -- arrays ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def transmitter_enu_m(self) -> FloatArray:
+        """(transmitter, xyz) positions [m]."""
+        return read_only(np.array([t.position_enu_m for t in self.transmitter], np.float64))
+
+    @cached_property
+    def carrier_hz(self) -> FloatArray:
+        """(transmitter,) carrier offsets from the centre frequency [Hz]."""
+        return read_only(np.array([t.carrier_hz for t in self.transmitter], np.float64))
+
+    @cached_property
+    def tone_hz(self) -> FloatArray:
+        """(tone,) tone frequencies [Hz]."""
+        speed = self.radio.propagation_speed_mps
+        return read_only(np.array([t.frequency_hz or speed / (t.wavelength_m or np.nan) for t in self.tone]))
+
+    @cached_property
+    def wavelength_m(self) -> FloatArray:
+        """(tone,) tone wavelengths [m]."""
+        return read_only(self.radio.propagation_speed_mps / self.tone_hz)
+
+    @cached_property
+    def line_hz(self) -> FloatArray:
+        """(transmitter, line) spectral lines, offset from the centre frequency [Hz].
+
+        Lines of a transmitter: carrier, then upper and lower sideband of each tone.
+        """
+        offset = [0.0]
+        for tone_hz in self.tone_hz:
+            offset += [tone_hz, -tone_hz]
+        return read_only(self.carrier_hz[:, None] + np.array(offset)[None, :])
+
+    @cached_property
+    def calibration_enu_m(self) -> FloatArray:
+        """(calibration receiver, xyz) surveyed positions [m]."""
+        return read_only(np.array([r.position_enu_m for r in self.calibration_receiver]).reshape(-1, 3))
+
+    @cached_property
+    def pivot_enu_m(self) -> FloatArray:
+        """(heliostat, xyz) pivot positions [m]."""
+        return read_only(np.array([h.pivot_enu_m for h in self.heliostat]).reshape(-1, 3))
+
+    @cached_property
+    def transmitter_ids(self) -> tuple[str, ...]:
+        """Transmitter identifiers in file order."""
+        return tuple(t.id for t in self.transmitter)
+
+    @cached_property
+    def heliostat_ids(self) -> tuple[str, ...]:
+        """Heliostat identifiers in file order."""
+        return tuple(h.id for h in self.heliostat)
+
+    @cached_property
+    def receivers(self) -> tuple[Receiver, ...]:
+        """The receiver axis."""
+        rows = []
+        for i, heliostat in enumerate(self.heliostat):
+            for receiver_id in heliostat.receiver_ids:
+                shared = heliostat.oscillator == "shared"
+                rows.append(Receiver(receiver_id, i, None, heliostat.id if shared else receiver_id))
+        for i, calibration in enumerate(self.calibration_receiver):
+            rows.append(Receiver(calibration.id, None, i, calibration.id))
+        return tuple(rows)
+
+    @cached_property
+    def receiver_ids(self) -> tuple[str, ...]:
+        """Identifiers along the receiver axis."""
+        return tuple(r.id for r in self.receivers)
+
+    # -- derived -----------------------------------------------------------------------------------------
+
+    def receiver_rows(self, i_heliostat: int) -> slice:
+        """Rows of the receiver axis that belong to one heliostat."""
+        start = sum(len(h.receiver_ids) for h in self.heliostat[:i_heliostat])
+        return slice(start, start + len(self.heliostat[i_heliostat].receiver_ids))
+
+    def scaled(self, factor: float) -> Scenario:
+        """Return the scenario with every length, and every tone's wavelength, multiplied by ``factor``.
+
+        Swart et al. §4.5: positions and normals scale with it, so one layout serves every field size. Carrier
+        frequencies stay as they are.
+        """
+        if not (math.isfinite(factor) and factor > 0):
+            raise ScenarioError(f"`scale` must be a finite number greater than zero, got {factor}")
+        if factor == 1.0:
+            return self
+        data = self.model_dump(exclude_none=True)
+        scale_lengths(data, factor)
+        return Scenario.model_validate(data)
+
+    def to_toml(self) -> str:
+        """Return the scenario as TOML that `parse_scenario` reads back to an equal record."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+
+    # -- contradictions ----------------------------------------------------------------------------------
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for check in CHECKS:
+            check(self)
+        return self

@@ -1,0 +1,133 @@
+"""What stands on a site and is recorded there: one frozen record a table of the scenario file."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rfpose import geometry
+
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+MAX_FRAME_SAMPLES = 2**24
+MIN_FRAME_SAMPLES = 64
+
+Point = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Identifier = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
+
+
+class Record(BaseModel):
+    """Frozen, refuses unknown keys, NaN and infinity."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Site(Record):
+    """Where the field is. Latitude and longitude place the sun; they are not needed to process radio."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
+    height_m: float = 0.0
+    aim_enu_m: Point | None = None
+    """Aim point of the heliostats (the tower's receiver)."""
+
+
+class Radio(Record):
+    """The recorded band and how it is cut into frames."""
+
+    sample_rate_hz: Positive
+    centre_frequency_hz: NonNegative
+    frame_samples: Annotated[int, Field(ge=MIN_FRAME_SAMPLES, le=MAX_FRAME_SAMPLES)]
+    propagation_speed_mps: Positive = SPEED_OF_LIGHT_MPS
+    clock_search_ppm: NonNegative = 50.0
+    """Receiver clocks are searched within plus and minus this offset."""
+
+    @property
+    def sample_rate(self) -> Fraction:
+        """Sample rate as a rational number [1/s]."""
+        return Fraction(self.sample_rate_hz).limit_denominator(1_000_000)
+
+
+class Tone(Record):
+    """One ranging sinusoid, common to all transmitters, given by its frequency or its wavelength."""
+
+    frequency_hz: Positive | None = None
+    wavelength_m: Positive | None = None
+    modulation_index: Positive = 0.8
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if (self.frequency_hz is None) == (self.wavelength_m is None):
+            raise ValueError("give exactly one of `frequency_hz` and `wavelength_m`")
+        return self
+
+
+class Transmitter(Record):
+    """A transmitter at a surveyed place; its carrier is given as the offset from the centre frequency."""
+
+    id: Identifier
+    position_enu_m: Point
+    carrier_hz: float
+    amplitude: Positive = 1.0
+
+
+class CalibrationReceiver(Record):
+    """A receiver at a surveyed place, from which the transmitters' electronic phases are measured."""
+
+    id: Identifier
+    position_enu_m: Point
+    survey_sigma_m: NonNegative = 0.0
+
+
+class Mirror(Record):
+    """What the mirrors have in common; a heliostat may override each entry.
+
+    Receivers are given in the mirror frame (x to the right seen from the front, y up, z along the normal),
+    whose origin is the mirror's centre. The centre lies ``arm_m`` from the pivot along the normal.
+    """
+
+    receiver_mirror_m: tuple[Point, ...] | None = None
+    arm_m: NonNegative = 0.0
+    oscillator: Literal["shared", "separate"] = "shared"
+    receiver_delay_sigma_s: NonNegative | None = None
+    """How well the delays between a mirror's receivers are known; without it they are unknown in every frame."""
+    pivot_sigma_m: Positive | None = None
+    """How well pivots are surveyed; without it they are not used."""
+    carrier_phase: bool = True
+    """Whether receivers on one oscillator also compare the carriers' own phases."""
+    mount: Literal["free", "azimuth_elevation"] = "free"
+    """Whether orientation is held to a two-axis mount, whose mirror keeps its x axis horizontal."""
+
+
+class Heliostat(Record):
+    """One heliostat: a pivot and three or more receivers fixed to its mirror."""
+
+    id: Identifier
+    pivot_enu_m: Point
+    receiver_mirror_m: tuple[Point, ...]
+    receiver_ids: tuple[Identifier, ...]
+    arm_m: NonNegative = 0.0
+    oscillator: Literal["shared", "separate"] = "shared"
+    receiver_delay_sigma_s: NonNegative | None = None
+    pivot_sigma_m: Positive | None = None
+    carrier_phase: bool = True
+    mount: Literal["free", "azimuth_elevation"] = "free"
+    normal_enu: Point | None = None
+    """Posture for simulation; without it the mirror reflects the simulated sun onto the aim point."""
+
+    @model_validator(mode="after")
+    def _receivers_span_a_plane(self) -> Self:
+        n = len(self.receiver_mirror_m)
+        if n < 3:
+            raise ValueError(f"`receiver_mirror_m` must hold three or more receivers, got {n}")
+        if len(self.receiver_ids) != n:
+            raise ValueError(f"`receiver_ids` must name all {n} receivers, got {len(self.receiver_ids)}")
+        if geometry.is_collinear(self.receiver_mirror_m):
+            raise ValueError("`receiver_mirror_m` must not lie on a line: a line fixes no normal; move one aside")
+        if self.normal_enu is not None and math.hypot(*self.normal_enu) < 1e-9:
+            raise ValueError("`normal_enu` must not be zero")
+        return self

@@ -1,0 +1,67 @@
+"""How a recording of the site is simulated: the ``[simulation]`` table."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from rfpose.scenario.records import Identifier, NonNegative, Positive, Record
+
+
+class Ground(Record):
+    """A level ground that reflects each transmitter as its mirror image (simulation)."""
+
+    coefficient: tuple[float, float]
+    """Complex reflection coefficient at RF: real and imaginary part."""
+    height_m: float = 0.0
+
+
+class Blockage(Record):
+    """One transmitter hidden from some receivers for some frames (simulation)."""
+
+    transmitter: Identifier
+    receivers: tuple[Identifier, ...] = ()
+    """Receiver or heliostat identifiers; empty means all."""
+    first_frame: Annotated[int, Field(ge=0)] = 0
+    last_frame: Annotated[int, Field(ge=0)] = 2**31
+    attenuation_db: NonNegative = 200.0
+
+
+class Dropout(Record):
+    """Samples that one receiver lost (simulation): an explicit gap in the recording."""
+
+    receiver: Identifier
+    frame: Annotated[int, Field(ge=0)]
+    first_sample: Annotated[int, Field(ge=0)]
+    sample_count: Annotated[int, Field(gt=0)]
+
+
+class Simulation(Record):
+    """How `rfpose simulate` makes a recording of this scenario."""
+
+    frame_count: Annotated[int, Field(gt=0)] = 4
+    frame_interval_s: NonNegative = 0.0
+    """Start to start; zero records frames back to back."""
+    start_unix_s: Annotated[int, Field(ge=0)] = 1_782_043_200
+    tone_snr_db: float = 40.0
+    """First tone of a transmitter of amplitude one at the reference range, against all noise in the recorded
+    band, per sample: ``(a m)² / σ²`` with σ² the variance of the complex noise."""
+    path_loss: Literal["none", "free_space"] = "none"
+    reference_range_m: Positive = 100.0
+    sample_format: Literal["int16", "complex64"] = "int16"
+    adc_bits: Annotated[int, Field(ge=2, le=16)] = 16
+    headroom_db: float = 3.0
+    """Full scale above the largest possible signal; negative clips."""
+    clock_offset_ppm: NonNegative = 0.0
+    """Each oscillator's offset is drawn uniformly from plus and minus this."""
+    receiver_delay_s: NonNegative = 0.0
+    """Standard deviation of each receiver's hardware delay."""
+    receiver_delay_drift_s_per_sqrt_min: NonNegative = 0.0
+    transmitter_phase_drift_rad_per_sqrt_h: NonNegative = 0.0
+    sun_azimuth_deg: float | tuple[float, float] | None = None
+    """One value, or the values at the first and the last frame."""
+    sun_elevation_deg: float | tuple[float, float] | None = None
+    ground: Ground | None = None
+    blocked: tuple[Blockage, ...] = ()
+    dropped: tuple[Dropout, ...] = ()
