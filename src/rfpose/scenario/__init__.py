@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from rfpose.scenario._reading import load_scenario, parse_scenario
 from rfpose.scenario._scenario import Receiver, Scenario
+from rfpose.scenario.budget import Budget
 from rfpose.scenario.records import (
     MAX_FRAME_SAMPLES,
     MIN_FRAME_SAMPLES,
@@ -27,6 +28,7 @@ __all__ = [
     "MIN_FRAME_SAMPLES",
     "SPEED_OF_LIGHT_MPS",
     "Blockage",
+    "Budget",
     "CalibrationReceiver",
     "Dropout",
     "Ground",

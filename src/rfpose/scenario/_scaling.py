@@ -8,13 +8,17 @@ _LENGTH_KEYS = frozenset(
     {
         "aim_enu_m",
         "arm_m",
+        "ground_height_sigma_m",
         "height_m",
+        "multipath_excess_m",
         "pivot_enu_m",
         "pivot_sigma_m",
         "position_enu_m",
         "receiver_mirror_m",
+        "receiver_mirror_sigma_m",
         "reference_range_m",
         "survey_sigma_m",
+        "transmitter_survey_sigma_m",
         "wavelength_m",
     }
 )

@@ -14,6 +14,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import ScenarioError
 from rfpose.scenario._consistency import CHECKS
 from rfpose.scenario._scaling import scale_lengths
+from rfpose.scenario.budget import Budget
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
 
@@ -41,6 +42,7 @@ class Scenario(Record):
     calibration_receiver: tuple[CalibrationReceiver, ...] = ()
     heliostat: tuple[Heliostat, ...] = ()
     simulation: Simulation = Simulation()
+    budget: Budget = Budget()
 
     def __eq__(self, other: object) -> bool:
         # not pydantic's own comparison, which trips over the cached arrays
