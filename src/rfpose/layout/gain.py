@@ -1,0 +1,307 @@
+"""What an error of each range does to each normal: the linear estimator itself, not only its covariance.
+
+`rfpose.layout.maps` needs the covariance alone and takes short cuts to it. A budget, and the question what a wrong survey
+does, need the estimator: the derivative of the solved normal by every range and every prior that enters it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, as_float_array
+from rfpose.errors import InvalidInputError
+from rfpose.layout.maps import Estimator, Mirrors, Noise, _groups, _plane_slope
+
+__all__ = ["Gain", "Reflection", "gain_of", "normal_gain"]
+
+_CHUNK = 256
+_FLOOR = 1e-13
+"""Smallest share of an unknown's information that the others may leave before it counts as unobserved."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gain:
+    """Derivatives of the solved normals; NaN where a pose is not determined.
+
+    A normal's error has two components, along the mirror's own x and y axes [rad].
+
+    Attributes
+    ----------
+    range_slope : (mirror, xy, group, receiver, transmitter)
+        By each range [1/m]. A group is a tone or the carrier.
+    pivot_slope : (mirror, xy, xyz)
+        By the surveyed pivot [1/m]; zero where it is not used.
+    shared_slope : (mirror, xy, shared)
+        By the unknowns that all mirrors share (reflection coefficients), at the mirror's own ranges.
+    shared_range_slope : (mirror, shared, group, receiver, transmitter)
+        What each range does to the shared unknowns [1/m].
+    shared_pivot_slope : (mirror, shared, xyz)
+        What each pivot's survey does to them [1/m].
+    """
+
+    range_slope: FloatArray
+    pivot_slope: FloatArray
+    shared_slope: FloatArray
+    shared_range_slope: FloatArray
+    shared_pivot_slope: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reflection:
+    """How reflections bend ranges about the expected poses.
+
+    Attributes
+    ----------
+    place_slope : (mirror, group, receiver, transmitter, xyz)
+        What a receiver's place adds to the range besides the direct ray's direction.
+    shared_slope : (mirror, group, receiver, transmitter, shared)
+        By real and imaginary part of each coefficient that is estimated [m]; no columns where all are known.
+    """
+
+    place_slope: FloatArray
+    shared_slope: FloatArray
+
+
+def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, estimator: Estimator) -> Gain:
+    """Return the gain of an estimator for noise as `rfpose.layout.maps` counts it.
+
+    With it, Σ slope² σ² over own noise, and over sums of slopes for what receivers share, is the square of
+    `rfpose.layout.maps.normal_map`.
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    mirrors, noise, estimator
+        See `rfpose.layout.maps`.
+
+    Raises
+    ------
+    InvalidInputError
+        Shapes that do not fit; an estimator that needs the carrier where ``noise`` has none.
+    """
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    weight, bias_info, group_class = _groups(noise, estimator)
+    own = np.broadcast_to(weight[:, None] ** -0.5, (len(weight), mirrors.receiver_mirror_m.shape[1], len(transmitter)))
+    sigma = np.broadcast_to(own, (len(mirrors.pivot_enu_m), *own.shape))
+    if noise.reference_range_m is not None:
+        distance = np.linalg.norm(mirrors.receiver_enu_m[:, :, None] - transmitter, axis=-1)
+        sigma = sigma * distance[:, None] / noise.reference_range_m
+    with np.errstate(divide="ignore"):
+        common = bias_info**-0.5
+    return normal_gain(transmitter, mirrors, sigma, common, group_class, estimator)
+
+
+def normal_gain(
+    transmitter_enu_m: npt.ArrayLike,
+    mirrors: Mirrors,
+    sigma_m: npt.ArrayLike,
+    transmitter_sigma_m: npt.ArrayLike,
+    clock_class: npt.ArrayLike,
+    estimator: Estimator,
+    *,
+    reflection: Reflection | None = None,
+) -> Gain:
+    """Return the derivative of each mirror's solved normal by its ranges and priors.
+
+    Generalised least squares about the expected poses, with the weights that the solver would use.
+
+    Parameters
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    mirrors
+        Expected poses.
+    sigma_m : (mirror, group, receiver, transmitter)
+        Own noise that the solver assumes [m]; infinity = not received.
+    transmitter_sigma_m : (group, transmitter)
+        Error common to all receivers that it assumes; infinity = not calibrated [m].
+    clock_class : (group,)
+        Which clocks a group sees.
+    estimator
+        Clocks, pivot and mount as the solver knows them.
+    reflection
+        In the model of the solver; rigid estimators only.
+
+    Raises
+    ------
+    InvalidInputError
+        Shapes that do not fit.
+    """
+    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    n_mirror, n_receiver = len(mirrors.pivot_enu_m), mirrors.receiver_mirror_m.shape[1]
+    common = as_float_array("transmitter_sigma_m", transmitter_sigma_m, ("group", len(transmitter)), finite=False)
+    shape = (n_mirror, len(common), n_receiver, len(transmitter))
+    sigma = as_float_array("sigma_m", sigma_m, shape, finite=False, positive=True)
+    classes = np.asarray(clock_class, np.int64)
+    if classes.shape != (len(common),):
+        raise InvalidInputError(f"`clock_class` must have shape ({len(common)},), got {classes.shape}")
+    if reflection is not None and not estimator.rigid:
+        raise InvalidInputError("`reflection` needs a rigid estimator: single receivers are located by direct rays")
+    parts = []
+    for begin in range(0, n_mirror, _CHUNK):
+        rows = slice(begin, begin + _CHUNK)
+        part = _part(mirrors, rows)
+        if not estimator.rigid:
+            parts.append(_independent(transmitter, part, sigma[rows], common))
+            continue
+        bent = None
+        if reflection is not None:
+            bent = Reflection(place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows])
+        parts.append(_rigid(transmitter, part, sigma[rows], common, classes, estimator, bent))
+    range_slope, pivot_slope, shared_slope, by_range, by_pivot, schur = (
+        np.concatenate(arrays) for arrays in zip(*parts, strict=True)
+    )
+    if shared_slope.shape[2]:
+        inverse = np.linalg.inv(schur.sum(axis=0))
+        by_range, by_pivot = np.einsum("pq,mqgrt->mpgrt", inverse, by_range), np.einsum("pq,mqx->mpx", inverse, by_pivot)
+    return Gain(
+        range_slope=range_slope,
+        pivot_slope=pivot_slope,
+        shared_slope=shared_slope,
+        shared_range_slope=by_range,
+        shared_pivot_slope=by_pivot,
+    )
+
+
+def _part(mirrors: Mirrors, rows: slice) -> Mirrors:
+    places = mirrors.receiver_mirror_m
+    return Mirrors(
+        pivot_enu_m=mirrors.pivot_enu_m[rows],
+        rot_enu_from_mirror=mirrors.rot_enu_from_mirror[rows],
+        receiver_mirror_m=places if len(places) == 1 else places[rows],
+    )
+
+
+def _directions(transmitter: FloatArray, mirrors: Mirrors) -> FloatArray:
+    """(mirror, receiver, transmitter, xyz) unit vectors from transmitters to receivers."""
+    offset = mirrors.receiver_enu_m[:, :, None] - transmitter
+    return np.asarray(offset / np.linalg.norm(offset, axis=-1, keepdims=True))
+
+
+def _independent(
+    transmitter: FloatArray, mirrors: Mirrors, sigma: FloatArray, common: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Each receiver by itself, then the plane through them."""
+    n_mirror, n_group, n_receiver, n_transmitter = sigma.shape
+    u = _directions(transmitter, mirrors)[:, None]
+    weight = 1.0 / (sigma**2 + common[:, None] ** 2)
+    mean = np.einsum("mgrt,mgrta->mgra", weight, np.broadcast_to(u, (*sigma.shape, 3)))
+    centred = u - (mean / weight.sum(axis=3)[..., None])[:, :, :, None]
+    rows = weight[..., None] * centred
+    place_gain = _inverse(np.einsum("mgrta,mgrtb->mrab", rows, centred))
+    slope = np.broadcast_to(_plane_slope(mirrors.receiver_mirror_m), (n_mirror, n_receiver, 3, 3))[:, :, :2]
+    by_place = np.einsum("mrkc,mac->mrka", slope, mirrors.rot_enu_from_mirror)
+    out = np.einsum("mrka,mrab,mgrtb->mkgrt", by_place, place_gain, rows)
+    return out, np.zeros((n_mirror, 2, 3)), *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
+
+
+def _nothing_shared(n_mirror: int, n_group: int, n_receiver: int, n_transmitter: int) -> tuple[FloatArray, ...]:
+    shape = (n_group, n_receiver, n_transmitter)
+    return tuple(
+        np.zeros(size) for size in ((n_mirror, 2, 0), (n_mirror, 0, *shape), (n_mirror, 0, 3), (n_mirror, 0, 0))
+    )
+
+
+def _rigid(
+    transmitter: FloatArray,
+    mirrors: Mirrors,
+    sigma: FloatArray,
+    common: FloatArray,
+    classes: npt.NDArray[np.int64],
+    estimator: Estimator,
+    reflection: Reflection | None,
+) -> tuple[FloatArray, ...]:
+    """All receivers in one fit; the transmitters' common errors come off as weighted means over receivers."""
+    n_mirror, n_group, n_receiver, n_transmitter = sigma.shape
+    rot = mirrors.rot_enu_from_mirror
+    direction = np.broadcast_to(_directions(transmitter, mirrors)[:, None], (*sigma.shape, 3))
+    n_shared = 0
+    if reflection is not None:
+        direction = direction + reflection.place_slope
+        n_shared = reflection.shared_slope.shape[-1]
+    arm = mirrors.receiver_enu_m - mirrors.pivot_enu_m[:, None]
+    clock = _clock_columns(classes, n_receiver, shared=estimator.clock_sigma_m == 0.0)
+    n_pose = 6 + clock.shape[-1]
+    rows = np.zeros((*sigma.shape, n_pose + n_shared))
+    rows[..., :3] = direction
+    rows[..., 3:6] = np.cross(arm[:, None, :, None], direction)
+    rows[..., 6:n_pose] = clock[None, :, :, None]
+    if reflection is not None:
+        rows[..., n_pose:] = reflection.shared_slope
+    weight = sigma**-2.0
+    with np.errstate(divide="ignore"):
+        bias_info = common**-2.0
+    total = weight.sum(axis=2) + bias_info
+    mean = np.einsum("mgrt,mgrtk->mgtk", weight, rows) / np.where(total > 0.0, total, 1.0)[..., None]
+    weighed = weight[..., None] * (rows - mean[:, :, None])
+    info = np.einsum("mgrtk,mgrtl->mkl", rows, weighed)
+    _add_priors(info, rot, weight, bias_info, classes, n_receiver, estimator)
+    flat = weighed.reshape(n_mirror, -1, n_pose + n_shared)
+    pose = _inverse(info[:, :n_pose, :n_pose])
+    to_normal = np.zeros((n_mirror, 2, n_pose))
+    to_normal[:, 0, 3:6], to_normal[:, 1, 3:6] = rot[:, :, 1], -rot[:, :, 0]
+    solve = to_normal @ pose
+    out = (solve @ np.swapaxes(flat[:, :, :n_pose], 1, 2)).reshape(n_mirror, 2, *sigma.shape[1:])
+    pivot_info = estimator.pivot_sigma_m**-2.0
+    pivot = solve[:, :, :3] * pivot_info
+    if not n_shared:
+        return out, pivot, *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
+    cross = info[:, n_pose:, :n_pose]
+    follow = cross @ pose
+    by_range = np.swapaxes(flat[:, :, n_pose:] - flat[:, :, :n_pose] @ np.swapaxes(follow, 1, 2), 1, 2)
+    schur = info[:, n_pose:, n_pose:] - follow @ np.swapaxes(cross, 1, 2)
+    shared = -solve @ np.swapaxes(cross, 1, 2)
+    by_range = by_range.reshape(n_mirror, n_shared, *sigma.shape[1:])
+    return out, pivot, shared, by_range, -follow[:, :, :3] * pivot_info, schur
+
+
+def _clock_columns(classes: npt.NDArray[np.int64], n_receiver: int, *, shared: bool) -> FloatArray:
+    """(group, receiver, clock) which clock a receiver's range of a group holds."""
+    n_clock = 1 if shared else n_receiver
+    out = np.zeros((len(classes), n_receiver, (int(classes.max()) + 1) * n_clock))
+    for g, k in enumerate(classes):
+        for r in range(n_receiver):
+            out[g, r, k * n_clock + (0 if shared else r)] = 1.0
+    return out
+
+
+def _add_priors(
+    info: FloatArray,
+    rot: FloatArray,
+    weight: FloatArray,
+    bias_info: FloatArray,
+    classes: npt.NDArray[np.int64],
+    n_receiver: int,
+    estimator: Estimator,
+) -> None:
+    """Pivot, mount, ties between clocks; a common clock that is the transmitters' own is held, which says nothing."""
+    info[:, :3, :3] += np.eye(3) * estimator.pivot_sigma_m**-2.0
+    if estimator.two_axis:
+        roll = np.stack([rot[:, 1, 0], -rot[:, 0, 0]], axis=1)
+        info[:, 3:5, 3:5] += estimator.roll_sigma_rad**-2.0 * roll[:, :, None] * roll[:, None]
+    shared = estimator.clock_sigma_m == 0.0
+    n_clock = 1 if shared else n_receiver
+    for k in range(int(classes.max()) + 1):
+        first = 6 + k * n_clock
+        if not np.any(bias_info[classes == k] > 0.0):
+            info[:, first, first] += np.maximum(weight[:, classes == k].sum(axis=(1, 2, 3)), 1.0)
+        if not shared and np.isfinite(estimator.clock_sigma_m):
+            tie = np.eye(n_clock) - 1.0 / n_clock
+            info[:, first : first + n_clock, first : first + n_clock] += tie / estimator.clock_sigma_m**2
+
+
+def _inverse(info: FloatArray) -> FloatArray:
+    """Inverse of each symmetric matrix, scaled to a unit diagonal first; NaN where it is singular."""
+    size = np.einsum("...kk->...k", info)
+    good = np.all(size > 0.0, axis=-1) & np.isfinite(info).all(axis=(-2, -1))
+    root = np.sqrt(np.where(good[..., None], size, 1.0))
+    scaled = np.where(good[..., None, None], info / (root[..., :, None] * root[..., None, :]), np.eye(info.shape[-1]))
+    good &= np.linalg.eigvalsh(scaled)[..., 0] > _FLOOR
+    scaled[~good] = np.eye(info.shape[-1])
+    out = np.linalg.inv(scaled) / (root[..., :, None] * root[..., None, :])
+    out[~good] = np.nan
+    return np.asarray(out)
