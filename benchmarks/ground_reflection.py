@@ -259,9 +259,10 @@ def speed(n_mirror: int) -> None:
             wall.append(time.perf_counter() - start)
             cpu.append(time.process_time() - start_cpu)
         best = int(np.argmin(wall))
+        solved = solution.status == 0
         print(
             f"RF {rf_hz / 1e6:.0f} MHz: {wall[best]:.2f} s, {cpu[best]:.2f} s of processor; "
-            f"{int((solution.status == 0).sum())} solved, rms {rms(field.error_mrad(solution)):.3f} mrad"
+            f"{int(solved.sum())} solved, rms {rms(field.error_mrad(solution)[solved]):.3f} mrad"
         )
 
 
