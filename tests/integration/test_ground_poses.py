@@ -16,24 +16,12 @@ from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat.ground import GroundStatus, Reflector, Surface, fresnel_coefficient, solve_with_ground
 from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
 from rfpose.multilat.rigid.integers import Observation
+from sites import TABLE_2
 
 SPEED = 299_792_458.0
 SIGMA_RAD = 80e-6
 TONE_HZ = (0.75e6, 7.5e6)
-TRANSMITTER = 100.0 * np.array(
-    [
-        (1, 0, 0.2),
-        (0.5, 0.866, 0.3),
-        (-0.5, 0.866, 0.2),
-        (-1, 0, 0.3),
-        (-0.5, -0.866, 0.2),
-        (0.5, -0.866, 0.3),
-        (0.433, 0.25, 0.4),
-        (-0.433, 0.25, 0.4),
-        (0, -0.5, 0.4),
-        (0, 0, 0.5),
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 PLACES = 1.73 / np.sqrt(3.0) * np.array([[1, 0, 0], [-0.5, np.sqrt(0.75), 0], [-0.5, -np.sqrt(0.75), 0]])
 
 

@@ -8,22 +8,10 @@ import pytest
 
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat import joint_covariance, locate, normal_bound, position_bound, solve_poses
+from sites import TABLE_2
 
 N = 20_000
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 UNEQUAL = np.array([1.0, 2.0, 1.5, 3.0, 0.7, 1.0, 5.0, 1.2, 0.8, 1.0]) * 1e-3
 MISSING = np.where(np.arange(10) % 4 == 1, np.nan, UNEQUAL)
 SQUARE = np.array([[1.5, 1.0, 0.0], [-1.5, 1.0, 0.0], [-1.5, -1.0, 0.0], [1.5, -1.0, 0.0]])

@@ -7,22 +7,10 @@ from rfpose.errors import InvalidInputError
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.rigid import Knowledge, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
+from sites import TABLE_2
 
 SPEED = 299_792_458.0
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 PLACES = 1.73 / np.sqrt(3) * np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([0, 120, 240])])
 SIGMA = 1e-3  # of one transmitter's range: the paper's noise on a 100 m field
 N_FRAME, N_MIRROR = 60, 40

@@ -8,21 +8,9 @@ import pytest
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.rigid import Knowledge, RigidStatus, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.multilat.rigid.integers import Observation, align_points, solve_ladder
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 PLACES = 1.73 / np.sqrt(3) * np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians([0, 120, 240])])
 SPEED = 299_792_458.0
 N = 3000

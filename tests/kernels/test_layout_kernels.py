@@ -8,13 +8,9 @@ from rfpose.layout.maps import ESTIMATORS, Estimator, Noise, dilution, mirrors_f
 from rfpose.layout.optimise import CRITERIA, _rows
 from rfpose.multilat import dop, normal_bound, position_bound
 from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1.0, 0.0, 0.2], [0.5, 0.866, 0.3], [-0.5, 0.866, 0.2], [-1.0, 0.0, 0.3], [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3], [0.433, 0.25, 0.4], [-0.433, 0.25, 0.4], [0.0, -0.5, 0.4], [0.0, 0.0, 0.5],
-    ]
-)  # fmt: skip
+TRANSMITTER = 100.0 * TABLE_2
 PLACES = np.array([[0.9988, 0.0, 0.0], [-0.4994, 0.865, 0.0], [-0.4994, -0.865, 0.02]])
 N = 40
 

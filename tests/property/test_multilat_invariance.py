@@ -7,21 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rfpose.multilat import locate, mirror_normal
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 SIGMA = 0.01
 seeds = st.integers(0, 2**31)
 

@@ -5,13 +5,9 @@ import pytest
 
 from rfpose.layout.maps import dilution, disc_points, mirrors_facing
 from rfpose.layout.optimise import Constraints, Zone, evaluate_placement, optimise
+from sites import TABLE_2
 
-TABLE2 = np.array(
-    [
-        [1.0, 0.0, 0.2], [0.5, 0.866, 0.3], [-0.5, 0.866, 0.2], [-1.0, 0.0, 0.3], [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3], [0.433, 0.25, 0.4], [-0.433, 0.25, 0.4], [0.0, -0.5, 0.4], [0.0, 0.0, 0.5],
-    ]
-)  # fmt: skip
+TABLE2 = TABLE_2
 PLACES = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
 
 

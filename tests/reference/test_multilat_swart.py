@@ -14,22 +14,10 @@ from rfpose.multilat import (
     solve_poses,
     tilt_rms_from_position,
 )
+from sites import TABLE_2
 
 # R1: Table 2, unit radius
-TRANSMITTER = np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = TABLE_2
 SPACING = 0.0173
 TRIANGLE = SPACING / np.sqrt(3) * np.array([[1, 0, 0], [-0.5, np.sqrt(0.75), 0], [-0.5, -np.sqrt(0.75), 0]])
 SIGMA_PHASE2 = 4.65e-10

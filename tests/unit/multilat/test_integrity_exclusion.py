@@ -11,21 +11,9 @@ from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus, solve_
 from rfpose.multilat.integrity.exclusion import _problem
 from rfpose.multilat.integrity.hypotheses import judge, log_probability, noncentrality
 from rfpose.multilat.rigid import Knowledge, RigidStatus, solve_rigid
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 PLACES = np.array([[1.0, 0, 0], [-0.5, 0.866, 0], [-0.5, -0.866, 0]])
 SIGMA = 1e-3
 PIVOT = np.array([[40.0, 20.0, 3.0], [-70.0, 30.0, 3.0], [5.0, -60.0, 3.0], [20.0, 10.0, 3.0]])

@@ -6,21 +6,9 @@ import pytest
 from rfpose.errors import InvalidInputError
 from rfpose.multilat import FixStatus, locate
 from rfpose.multilat.integrity import locate_robust
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 SIGMA = 1e-3
 N = 300
 

@@ -5,21 +5,9 @@ import pytest
 
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat import RangeStatus, check_unambiguous, range_differences
+from sites import TABLE_2
 
-TRANSMITTER = 100.0 * np.array(
-    [
-        [1, 0, 0.2],
-        [0.5, 0.866, 0.3],
-        [-0.5, 0.866, 0.2],
-        [-1, 0, 0.3],
-        [-0.5, -0.866, 0.2],
-        [0.5, -0.866, 0.3],
-        [0.433, 0.25, 0.4],
-        [-0.433, 0.25, 0.4],
-        [0, -0.5, 0.4],
-        [0, 0, 0.5],
-    ]
-)
+TRANSMITTER = 100.0 * TABLE_2
 WAVELENGTH = np.array([400.0, 40.0])
 
 
