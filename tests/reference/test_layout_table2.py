@@ -7,7 +7,6 @@ from rfpose.layout.maps import dilution, disc_points, mirrors_facing
 from rfpose.layout.optimise import Constraints, Zone, evaluate_placement, optimise
 from sites import TABLE_2
 
-TABLE2 = TABLE_2
 PLACES = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
 
 
@@ -17,14 +16,14 @@ def disc(n):
 
 def test_dilution_at_the_centre_and_the_edge():
     # R2 counts per sigma of a difference, larger by √2
-    found = dilution(TABLE2, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]).position / np.sqrt(2.0)
+    found = dilution(TABLE_2, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]).position / np.sqrt(2.0)
     assert found == pytest.approx([1.010, 1.853], abs=1e-3)
 
 
 def test_rms_over_the_disc_converges():
     # every area alike; R2's 2.143 is no such average (docs/layout.md)
-    assert evaluate_placement(TABLE2, disc(20_000)) == pytest.approx(2.0455, abs=1e-3)
-    assert evaluate_placement(TABLE2, disc(5000)) == pytest.approx(2.0455, abs=2e-3)
+    assert evaluate_placement(TABLE_2, disc(20_000)) == pytest.approx(2.0455, abs=1e-3)
+    assert evaluate_placement(TABLE_2, disc(5000)) == pytest.approx(2.0455, abs=2e-3)
 
 
 def test_better_places_within_table2s_limits():
