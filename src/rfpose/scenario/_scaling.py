@@ -8,8 +8,10 @@ _LENGTH_KEYS = frozenset(
     {
         "aim_enu_m",
         "arm_m",
+        "field_radius_m",
         "ground_height_sigma_m",
         "height_m",
+        "inner_radius_m",
         "multipath_excess_m",
         "pivot_enu_m",
         "pivot_sigma_m",
@@ -18,6 +20,7 @@ _LENGTH_KEYS = frozenset(
         "receiver_mirror_sigma_m",
         "reference_range_m",
         "survey_sigma_m",
+        "target_enu_m",
         "transmitter_survey_sigma_m",
         "wavelength_m",
     }

@@ -17,6 +17,7 @@ from rfpose.scenario._scaling import scale_lengths
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
+from rfpose.scenario.tracking import Tracking
 
 
 class Receiver(NamedTuple):
@@ -43,6 +44,7 @@ class Scenario(Record):
     heliostat: tuple[Heliostat, ...] = ()
     simulation: Simulation = Simulation()
     budget: Budget = Budget()
+    tracking: Tracking = Tracking()
 
     def __eq__(self, other: object) -> bool:
         # not pydantic's own comparison, which trips over the cached arrays
