@@ -133,6 +133,11 @@ class BusSettings:
         """Chance that a packet has a wrong bit."""
         return float(-np.expm1(_BITS * np.log1p(-self.bit_error_rate)))
 
+    @property
+    def failing(self) -> float:
+        """Chance that a packet does not get through in one piece."""
+        return self.lost + self.corrupted * (1.0 - self.lost)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capacity:
@@ -273,7 +278,7 @@ def _fate(settings: BusSettings, n: int, rng: np.random.Generator) -> tuple[npt.
     draw = rng.random(n)
     status = np.full(n, MessageStatus.OK, np.int8)
     delay = np.zeros(n)
-    bad = draw < settings.lost + settings.corrupted * (1.0 - settings.lost)
+    bad = draw < settings.failing
     if bad.any():
         index = np.flatnonzero(bad)
         lost = draw[index] < settings.lost
