@@ -157,7 +157,10 @@ def normal_gain(
     )
     if shared_slope.shape[2]:
         inverse = np.linalg.inv(schur.sum(axis=0))
-        by_range, by_pivot = np.einsum("pq,mqgrt->mpgrt", inverse, by_range), np.einsum("pq,mqx->mpx", inverse, by_pivot)
+        by_range, by_pivot = (
+            np.einsum("pq,mqgrt->mpgrt", inverse, by_range),
+            np.einsum("pq,mqx->mpx", inverse, by_pivot),
+        )
     return Gain(
         range_slope=range_slope,
         pivot_slope=pivot_slope,

@@ -1,0 +1,411 @@
+"""What a solver will believe about a site, and how its ranges respond to what is off: the budget's working point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, read_only
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.layout.gain import Gain, Reflection, normal_gain
+from rfpose.layout.maps import Estimator, Mirrors, check_site, noise_of
+from rfpose.multilat import check_unambiguous
+from rfpose.multilat.ground import Reflector, range_shift_m
+from rfpose.multilat.rigid import Knowledge
+from rfpose.multilat.rigid.integers import Observation, solve_ladder
+from rfpose.scenario import Heliostat, Scenario
+
+__all__ = ["Plan", "make_plan"]
+
+_STEP_M = 1e-3
+_COEFFICIENT_STEP = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The working point: expected poses, wavelengths used, and what the solver assumes; arrays are read-only.
+
+    A group is a tone, coarsest first, or last the carrier.
+
+    Attributes
+    ----------
+    scenario, mirrors
+        The site, and the expected poses of its mirrors.
+    estimator
+        As `rfpose process` would solve them.
+    wavelength_m : (group, transmitter)
+        [m].
+    tone_hz : (group,)
+        Zero for the carrier [Hz].
+    clock_class : (group,)
+    thermal_m : (mirror, group, receiver, transmitter)
+        Own noise without the converter's [m].
+    calibration_thermal_m : (calibration receiver, tone, transmitter)
+        [m].
+    converter_share
+        Variance of rounding over that of thermal noise.
+    by_place, by_transmitter : (mirror, group, receiver, transmitter, xyz)
+        Slope of each range by the receiver's and by the transmitter's place.
+    calibration_by_place, calibration_by_transmitter : (calibration receiver, tone, transmitter, xyz)
+        The same at the calibration receivers.
+    """
+
+    scenario: Scenario
+    mirrors: Mirrors
+    estimator: Estimator
+    wavelength_m: FloatArray
+    tone_hz: FloatArray
+    clock_class: npt.NDArray[np.int64]
+    thermal_m: FloatArray
+    calibration_thermal_m: FloatArray
+    converter_share: float
+    by_place: FloatArray
+    by_transmitter: FloatArray
+    calibration_by_place: FloatArray
+    calibration_by_transmitter: FloatArray
+
+    @property
+    def n_tone(self) -> int:
+        """Tones used."""
+        return int(np.count_nonzero(self.tone_hz))
+
+    @property
+    def sigma_m(self) -> FloatArray:
+        """(mirror, group, receiver, transmitter) own noise that the solver assumes [m]."""
+        return self.thermal_m * np.sqrt(1.0 + self.converter_share)
+
+    @property
+    def survey_sigma_m(self) -> FloatArray:
+        """(calibration receiver,) survey in each axis [m]."""
+        return np.array([r.survey_sigma_m for r in self.scenario.calibration_receiver])
+
+    @property
+    def calibration_sigma_m(self) -> FloatArray:
+        """(calibration receiver, tone, transmitter) error of each one's phases that the solver assumes [m]."""
+        variance = self.calibration_thermal_m**2 * (1.0 + self.converter_share)
+        return np.asarray(np.sqrt(variance + self.survey_sigma_m[:, None, None] ** 2))
+
+    @property
+    def calibration_weight(self) -> FloatArray:
+        """(calibration receiver, tone, transmitter) share of each in the calibration, as `rfpose.dsp` weighs them."""
+        weight = self.calibration_sigma_m**-2.0
+        return np.asarray(weight / weight.sum(axis=0))
+
+    @property
+    def transmitter_sigma_m(self) -> FloatArray:
+        """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m]."""
+        out = np.full(self.wavelength_m.shape, np.inf)
+        if self.scenario.calibration_receiver:
+            out[: self.n_tone] = (self.calibration_sigma_m**-2.0).sum(axis=0) ** -0.5
+        return out
+
+    @property
+    def carrier_rf_hz(self) -> FloatArray:
+        """(transmitter,) carriers at RF [Hz]."""
+        return np.asarray(self.scenario.radio.centre_frequency_hz + self.scenario.carrier_hz)
+
+    @property
+    def reflects(self) -> bool:
+        """Whether the ground reflects and the solver knows it."""
+        return self.scenario.simulation.ground is not None and self.scenario.budget.ground != "ignored"
+
+    @property
+    def estimates_ground(self) -> bool:
+        """Whether the solver finds the reflection's coefficient itself."""
+        return self.reflects and self.scenario.budget.ground == "estimated"
+
+    def reflector(self, coefficient: complex | None, height_offset_m: float = 0.0) -> Reflector:
+        """Return the ground with a coefficient (None: to be estimated), at another height."""
+        ground = self.scenario.simulation.ground
+        assert ground is not None
+        return Reflector(point_enu_m=(0.0, 0.0, ground.height_m + height_offset_m), coefficient=coefficient)
+
+    def shift_m(
+        self, transmitter_enu_m: FloatArray, point_enu_m: FloatArray, reflector: Reflector, *, tones_only: bool = False
+    ) -> FloatArray:
+        """Return what a reflection adds to ranges, (..., transmitter, group) of points (..., xyz) [m]."""
+        tone = self.tone_hz[: self.n_tone] if tones_only else self.tone_hz
+        out = range_shift_m(
+            transmitter_enu_m,
+            point_enu_m.reshape(-1, 3),
+            reflectors=(reflector,),
+            carrier_rf_hz=self.carrier_rf_hz,
+            tone_hz=tone,
+            free_space=self.scenario.simulation.path_loss == "free_space",
+            propagation_speed_mps=self.scenario.radio.propagation_speed_mps,
+        )
+        return out.reshape(*point_enu_m.shape[:-1], *out.shape[1:])
+
+    def calibrated_shift_m(self, reflector: Reflector) -> FloatArray:
+        """(mirror, group, receiver, transmitter) what a reflection adds to calibrated ranges [m]."""
+        transmitter = self.scenario.transmitter_enu_m
+        shift = np.moveaxis(self.shift_m(transmitter, self.mirrors.receiver_enu_m, reflector), -1, 1)
+        if self.scenario.calibration_receiver:
+            there = self.shift_m(transmitter, self.scenario.calibration_enu_m, reflector, tones_only=True)
+            mean = np.einsum("ctg,cgt->gt", there, self.calibration_weight)
+            shift[:, : self.n_tone] -= mean[:, None]
+        return shift
+
+    def knowledge(self, pivot_enu_m: FloatArray) -> Knowledge:
+        """Return what the solver is told, with surveyed pivots (row, xyz)."""
+        known = np.isfinite(self.estimator.pivot_sigma_m)
+        return Knowledge(
+            clock_sigma_m=self.estimator.clock_sigma_m,
+            pivot_enu_m=pivot_enu_m if known else None,
+            pivot_sigma_m=self.estimator.pivot_sigma_m,
+            two_axis=self.estimator.two_axis,
+            roll_sigma_rad=self.estimator.roll_sigma_rad,
+        )
+
+    def gain(self) -> Gain:
+        """Return what each range does to each normal at the working point."""
+        reflection = None
+        if self.reflects:
+            direct = _directions(self.scenario.transmitter_enu_m, self.mirrors.receiver_enu_m)
+            reflection = Reflection(place_slope=self.by_place - direct[:, None], shared_slope=self._coefficient_slope())
+        return normal_gain(
+            self.scenario.transmitter_enu_m,
+            self.mirrors,
+            self.sigma_m,
+            self.transmitter_sigma_m,
+            self.clock_class,
+            self.estimator,
+            reflection=reflection,
+        )
+
+    def coefficient_slope(self) -> FloatArray:
+        """(mirror, group, receiver, transmitter, 2) of calibrated ranges by the coefficient's two parts [m]."""
+        ground = self.scenario.simulation.ground
+        assert ground is not None
+        value = complex(*ground.coefficient)
+        columns = [
+            self.calibrated_shift_m(self.reflector(value + step))
+            - self.calibrated_shift_m(self.reflector(value - step))
+            for step in (_COEFFICIENT_STEP, 1j * _COEFFICIENT_STEP)
+        ]
+        return np.stack(columns, axis=-1) / (2.0 * _COEFFICIENT_STEP)
+
+    def height_slope(self) -> FloatArray:
+        """(mirror, group, receiver, transmitter) of calibrated ranges by the ground's height."""
+        ground = self.scenario.simulation.ground
+        assert ground is not None
+        value = complex(*ground.coefficient)
+        above, below = (self.calibrated_shift_m(self.reflector(value, h)) for h in (_STEP_M, -_STEP_M))
+        return (above - below) / (2.0 * _STEP_M)
+
+    def _coefficient_slope(self) -> FloatArray:
+        if self.estimates_ground:
+            return self.coefficient_slope()
+        return np.zeros((*self.thermal_m.shape, 0))
+
+
+def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> Plan:
+    """Return the working point of a scenario's budget.
+
+    Finer tones and the carrier take part where the solver would trust their whole wavelengths on every mirror.
+
+    Parameters
+    ----------
+    scenario
+        Heliostats alike in receivers' number, clocks, pivots and mount.
+    mirrors
+        Its mirrors in their postures; several postures are several rows.
+    pose
+        ``rigid``, or ``independent`` for separately located receivers.
+
+    Raises
+    ------
+    InvalidInputError
+        Unknown ``pose``; ground known or estimated with separately located receivers.
+    GeometryError
+        Heliostats that differ; transmitters too few, on a line or plane; a field too wide for the longest tone.
+    """
+    if pose not in ("rigid", "independent"):
+        raise InvalidInputError(f"`pose` must be rigid or independent, got {pose!r}")
+    transmitter = check_site(scenario.transmitter_enu_m)
+    check_unambiguous(transmitter, scenario.wavelength_m)
+    estimator = _estimator(scenario, pose)
+    noise = noise_of(scenario)
+    order = np.argsort(-scenario.wavelength_m)
+    own, tone_hz = noise.tone_sigma_m[order], scenario.tone_hz[order]
+    wavelength = np.repeat(scenario.wavelength_m[order][:, None], len(transmitter), axis=1)
+    if estimator.carrier and noise.carrier_sigma_m is not None:
+        rf_hz = scenario.radio.centre_frequency_hz + scenario.carrier_hz
+        own = np.vstack([own, noise.carrier_sigma_m])
+        wavelength = np.vstack([wavelength, scenario.radio.propagation_speed_mps / rf_hz])
+        tone_hz = np.append(tone_hz, 0.0)
+    receiver = mirrors.receiver_enu_m
+    thermal = np.broadcast_to(own[:, None], (len(receiver), len(own), receiver.shape[1], len(transmitter)))
+    calibration = np.broadcast_to(own[tone_hz > 0.0], (len(scenario.calibration_receiver), *own[tone_hz > 0.0].shape))
+    if noise.reference_range_m is not None:
+        thermal = thermal * _ranges(transmitter, receiver)[:, None] / noise.reference_range_m
+        there = _ranges(transmitter, scenario.calibration_enu_m) / noise.reference_range_m
+        calibration = calibration * there[:, None]
+    plan = Plan(
+        scenario=scenario,
+        mirrors=mirrors,
+        estimator=estimator,
+        wavelength_m=read_only(wavelength),
+        tone_hz=tone_hz,
+        clock_class=_classes(scenario, tone_hz),
+        thermal_m=read_only(np.array(thermal)),
+        calibration_thermal_m=read_only(np.array(calibration)),
+        converter_share=_converter_share(scenario, receiver),
+        by_place=np.empty(0),
+        by_transmitter=np.empty(0),
+        calibration_by_place=np.empty(0),
+        calibration_by_transmitter=np.empty(0),
+    )
+    if plan.reflects and not estimator.rigid:
+        raise InvalidInputError("[budget] `ground` must be ignored with pose independent, which knows no reflection")
+    if estimator.rigid:
+        plan = _with_trusted_groups(plan)
+    return _with_slopes(plan)
+
+
+def _estimator(scenario: Scenario, pose: str) -> Estimator:
+    """The solver's settings, as `rfpose process` takes them from a scenario."""
+    if not scenario.heliostat:
+        raise GeometryError("the scenario has no heliostats; add some, or a field from CSV")
+    if pose == "independent":
+        return Estimator(name=pose, rigid=False)
+    kinds = {_kind(h) for h in scenario.heliostat}
+    if len(kinds) > 1:
+        raise GeometryError(
+            "heliostats differ in oscillator, delays, pivot survey, mount or carrier phase; study them in separate "
+            "scenarios"
+        )
+    one = scenario.heliostat[0]
+    shared = one.oscillator == "shared"
+    clock = np.inf
+    if shared and one.receiver_delay_sigma_s is not None:
+        clock = one.receiver_delay_sigma_s * scenario.radio.propagation_speed_mps
+    return Estimator(
+        name=pose,
+        clock_sigma_m=clock,
+        carrier=shared
+        and one.carrier_phase
+        and bool(np.all(scenario.radio.centre_frequency_hz + scenario.carrier_hz > 0)),
+        pivot_sigma_m=np.inf if one.pivot_sigma_m is None else one.pivot_sigma_m,
+        two_axis=one.mount == "azimuth_elevation",
+    )
+
+
+def _kind(heliostat: Heliostat) -> tuple[object, ...]:
+    h = heliostat
+    return h.oscillator, h.receiver_delay_sigma_s, h.pivot_sigma_m, h.mount, h.carrier_phase
+
+
+def _classes(scenario: Scenario, tone_hz: FloatArray) -> npt.NDArray[np.int64]:
+    """Clocks: one a tone and one for the carrier; where a reflection is solved for, one for all tones."""
+    if scenario.simulation.ground is not None and scenario.budget.ground != "ignored":
+        return np.where(tone_hz > 0.0, 0, 1).astype(np.int64)
+    return np.arange(len(tone_hz))
+
+
+def _converter_share(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
+    """Variance of a converter's rounding over that of thermal noise; see docs/simulation.md."""
+    plan = scenario.simulation
+    if plan.sample_format != "int16":
+        return 0.0
+    noise = scenario.tone[0].modulation_index * 10.0 ** (-plan.tone_snr_db / 20.0) / np.sqrt(2.0)
+    place = np.concatenate([receiver_enu_m.reshape(-1, 3), scenario.calibration_enu_m])
+    amplitude = np.array([t.amplitude for t in scenario.transmitter])
+    free = plan.path_loss == "free_space"
+    loss = plan.reference_range_m / _ranges(scenario.transmitter_enu_m, place) if free else 1.0
+    total = np.broadcast_to(amplitude * loss, (len(place), len(amplitude))).sum(axis=1)
+    if plan.ground is not None:
+        image = scenario.transmitter_enu_m * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * plan.ground.height_m]
+        loss = plan.reference_range_m / _ranges(image, place) if free else 1.0
+        reflected = np.broadcast_to(amplitude * loss, (len(place), len(amplitude))).sum(axis=1)
+        total = total + abs(complex(*plan.ground.coefficient)) * reflected
+    peak = (1.0 + sum(t.modulation_index for t in scenario.tone)) * float(total.max()) + 4.0 * noise
+    step = peak * 10.0 ** (plan.headroom_db / 20.0) / (2.0 ** (plan.adc_bits - 1) - 1.0)
+    return float(step**2 / 12.0 / noise**2)
+
+
+def _with_trusted_groups(plan: Plan) -> Plan:
+    """Keep the wavelengths whose integers the solver resolves on every mirror."""
+    mirrors, transmitter = plan.mirrors, plan.scenario.transmitter_enu_m
+    n_mirror = len(mirrors.pivot_enu_m)
+    distance = _ranges(transmitter, mirrors.receiver_enu_m)
+    places = np.broadcast_to(mirrors.receiver_mirror_m, (n_mirror, *mirrors.receiver_mirror_m.shape[1:]))
+    observations = [
+        Observation(
+            range_m=distance,
+            sigma_m=plan.sigma_m[:, g],
+            transmitter_sigma_m=np.broadcast_to(plan.transmitter_sigma_m[g], (n_mirror, len(transmitter))),
+            wavelength_m=plan.wavelength_m[g],
+            clock_class=int(plan.clock_class[g]),
+        )
+        for g in range(len(plan.tone_hz))
+    ]
+    solution = solve_ladder(
+        transmitter,
+        places,
+        observations,
+        start_pivot_enu_m=mirrors.pivot_enu_m,
+        start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
+        knowledge=plan.knowledge(mirrors.pivot_enu_m),
+    )
+    kept = solution.fixed.all(axis=0)
+    tones = kept[plan.tone_hz > 0.0]
+    return replace(
+        plan,
+        wavelength_m=plan.wavelength_m[kept],
+        tone_hz=plan.tone_hz[kept],
+        clock_class=_classes(plan.scenario, plan.tone_hz[kept]),
+        thermal_m=plan.thermal_m[:, kept],
+        calibration_thermal_m=plan.calibration_thermal_m[:, tones],
+    )
+
+
+def _with_slopes(plan: Plan) -> Plan:
+    """Add the slopes of ranges by receivers' and transmitters' places, reflections included where they are solved."""
+    transmitter, there = plan.scenario.transmitter_enu_m, plan.scenario.calibration_enu_m
+    receiver = plan.mirrors.receiver_enu_m
+    place = np.repeat(_directions(transmitter, receiver)[:, None], len(plan.tone_hz), axis=1)
+    tower = -place
+    calibration_place = np.repeat(_directions(transmitter, there)[:, None], plan.n_tone, axis=1)
+    calibration_tower = -calibration_place
+    if plan.reflects:
+        ground = plan.scenario.simulation.ground
+        assert ground is not None
+        reflector = plan.reflector(complex(*ground.coefficient))
+        for axis, step in enumerate(_STEP_M * np.eye(3)):
+            at = plan.shift_m(transmitter, receiver + step, reflector) - plan.shift_m(
+                transmitter, receiver - step, reflector
+            )
+            by = plan.shift_m(transmitter + step, receiver, reflector) - plan.shift_m(
+                transmitter - step, receiver, reflector
+            )
+            place[..., axis] += np.moveaxis(at, -1, 1) / (2.0 * _STEP_M)
+            tower[..., axis] += np.moveaxis(by, -1, 1) / (2.0 * _STEP_M)
+            if not len(there):
+                continue
+            at = plan.shift_m(transmitter, there + step, reflector, tones_only=True)
+            at = at - plan.shift_m(transmitter, there - step, reflector, tones_only=True)
+            by = plan.shift_m(transmitter + step, there, reflector, tones_only=True)
+            by = by - plan.shift_m(transmitter - step, there, reflector, tones_only=True)
+            calibration_place[..., axis] += np.moveaxis(at, -1, 1) / (2.0 * _STEP_M)
+            calibration_tower[..., axis] += np.moveaxis(by, -1, 1) / (2.0 * _STEP_M)
+    return replace(
+        plan,
+        by_place=read_only(place),
+        by_transmitter=read_only(tower),
+        calibration_by_place=read_only(calibration_place),
+        calibration_by_transmitter=read_only(calibration_tower),
+    )
+
+
+def _ranges(transmitter: FloatArray, point: FloatArray) -> FloatArray:
+    """(..., transmitter) distances [m]."""
+    return np.asarray(np.linalg.norm(point[..., None, :] - transmitter, axis=-1))
+
+
+def _directions(transmitter: FloatArray, point: FloatArray) -> FloatArray:
+    """(..., transmitter, xyz) unit vectors from transmitters to points."""
+    offset = point[..., None, :] - transmitter
+    return np.asarray(offset / np.linalg.norm(offset, axis=-1, keepdims=True))

@@ -1,0 +1,214 @@
+"""The budget: every source's share of each normal's error, by linear analysis and through the solver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, as_float_array, read_only
+from rfpose.errors import InvalidInputError
+from rfpose.layout.budget.plan import Plan
+from rfpose.layout.budget.sources import SOURCES, Effect, Source
+from rfpose.layout.budget.world import World
+from rfpose.layout.gain import Gain
+
+__all__ = ["BudgetLine", "ErrorBudget", "error_budget", "target_slope"]
+
+_BATCH_RANGES = 2_000_000
+"""Ranges drawn at once, for memory."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BudgetLine:
+    """One source, or several together; arrays are read-only, all angles of the mirror normal.
+
+    Attributes
+    ----------
+    name, assumed, remedy
+        What it is, what is assumed of it, what would reduce it.
+    normal_rad : (mirror,)
+        Rms angle by linear analysis [rad].
+    target_m : (mirror,)
+        Rms distance on the target, by the same [m]; NaN without an aim point.
+    drawn_normal_rad, drawn_target_m : (mirror,)
+        The same through the solver; NaN where nothing was drawn.
+    """
+
+    name: str
+    assumed: str
+    remedy: str
+    normal_rad: FloatArray
+    target_m: FloatArray
+    drawn_normal_rad: FloatArray
+    drawn_target_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorBudget:
+    """Sources, worst first, and the whole.
+
+    Attributes
+    ----------
+    lines
+        One a source that the site has.
+    whole
+        Linear: the root of the sum of squares of the lines. Drawn: all sources at once.
+    n_draw, n_failed
+        Frames drawn for each line; solutions that failed among all of them.
+    plan
+        The working point.
+    """
+
+    lines: tuple[BudgetLine, ...]
+    whole: BudgetLine
+    n_draw: int
+    n_failed: int
+    plan: Plan
+
+
+def error_budget(
+    plan: Plan,
+    *,
+    n_draw: int = 200,
+    seed: int = 0,
+    aim_enu_m: npt.ArrayLike | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ErrorBudget:
+    """Return the budget of a site.
+
+    Each source's slopes go through the estimator's gain: rms errors add as squares, sources being independent. With
+    draws, each line and the whole are also measured: exact ranges with errors, calibrated and solved by the solver itself.
+
+    Parameters
+    ----------
+    plan
+        See `make_plan`.
+    n_draw
+        Frames drawn for each line and for the whole; 0 for none.
+    seed
+        Equal seeds give equal results.
+    aim_enu_m : (xyz,), optional
+        Where beams go [m]; without, nothing is said of the target.
+    progress
+        Called with (lines done, lines).
+
+    Raises
+    ------
+    InvalidInputError
+        ``n_draw`` negative.
+    """
+    if n_draw < 0:
+        raise InvalidInputError(f"`n_draw` must not be negative, got {n_draw}")
+    gain = plan.gain()
+    to_target = target_slope(plan, aim_enu_m)
+    sources = [s for s in SOURCES if s.assumed(plan)]
+    streams = np.random.SeedSequence(seed).spawn(len(SOURCES) + 1)
+    lines, total, n_failed = [], np.zeros((len(plan.mirrors.pivot_enu_m), 2, 2)), 0
+    for k, source in enumerate(sources):
+        linear = _covariance(source.effects(plan, *_outputs(gain)), gain)
+        total += linear
+        drawn, failed = _draw(plan, [source], n_draw, streams[SOURCES.index(source)])
+        n_failed += failed
+        lines.append(_line(source.name, source.assumed(plan), source.remedy, linear, drawn, to_target))
+        if progress is not None:
+            progress(k + 1, len(sources) + 1)
+    drawn, failed = _draw(plan, sources, n_draw, streams[-1])
+    whole = _line("all together", "", "", total, drawn, to_target)
+    if progress is not None:
+        progress(len(sources) + 1, len(sources) + 1)
+    lines.sort(key=lambda line: -float(np.nanmean(line.normal_rad**2)))
+    return ErrorBudget(lines=tuple(lines), whole=whole, n_draw=n_draw, n_failed=n_failed + failed, plan=plan)
+
+
+def target_slope(plan: Plan, aim_enu_m: npt.ArrayLike | None) -> FloatArray:
+    """Return (mirror, xyz, xy): where the beam meets the target, by the normal's error along the mirror's axes [m/rad].
+
+    The beam to the aim point turns by 2 (n·s) δn + 2 (δn·s) n, s towards the sun: twice δn in the plane of incidence,
+    less by the cosine of the angle of incidence across it.
+    """
+    mirrors = plan.mirrors
+    if aim_enu_m is None:
+        return np.full((len(mirrors.pivot_enu_m), 3, 2), np.nan)
+    aim = as_float_array("aim_enu_m", aim_enu_m, (3,)) - mirrors.pivot_enu_m
+    distance = np.linalg.norm(aim, axis=1)
+    normal = mirrors.normal_enu
+    beam = aim / distance[:, None]
+    cosine = np.einsum("mx,mx->m", normal, beam)
+    sun = 2.0 * cosine[:, None] * normal - beam
+    axes = mirrors.rot_enu_from_mirror[:, :, :2]
+    turn = 2.0 * cosine[:, None, None] * axes + 2.0 * normal[:, :, None] * np.einsum("mx,mxk->mk", sun, axes)[:, None]
+    # a mirror with its back to the aim has no beam there
+    return np.asarray(np.where((cosine > 0.0)[:, None, None], distance[:, None, None] * turn, np.nan))
+
+
+def _outputs(gain: Gain) -> tuple[FloatArray, FloatArray]:
+    """Slopes of the normal and of what mirrors share, by ranges and by pivots."""
+    return (
+        np.concatenate([gain.range_slope, gain.shared_range_slope], axis=1),
+        np.concatenate([gain.pivot_slope, gain.shared_pivot_slope], axis=1),
+    )
+
+
+def _covariance(effects: Sequence[Effect], gain: Gain) -> FloatArray:
+    """(mirror, 2, 2) covariance of the normal's error along the mirror's axes [rad²]."""
+    out = np.zeros((len(gain.range_slope), 2, 2))
+    follow = gain.shared_slope
+    for effect in effects:
+        own = effect.slope[:, :2]
+        if effect.past_solver or not follow.shape[2]:
+            out += own @ np.swapaxes(own, 1, 2)
+            continue
+        shared = effect.slope[:, 2:]
+        if effect.common:
+            own = own + follow @ shared.sum(axis=0)
+            out += own @ np.swapaxes(own, 1, 2)
+            continue
+        # what the other mirrors' errors do through the unknowns in common
+        each = shared @ np.swapaxes(shared, 1, 2)
+        others = each.sum(axis=0) - each
+        out += follow @ others @ np.swapaxes(follow, 1, 2)
+        own = own + follow @ shared
+        out += own @ np.swapaxes(own, 1, 2)
+    return out
+
+
+def _draw(plan: Plan, sources: Sequence[Source], n_draw: int, stream: np.random.SeedSequence) -> tuple[FloatArray, int]:
+    """(mirror, 2, 2) mean square of the normal's error through the solver, NaN without draws; failed solutions."""
+    n_mirror = len(plan.mirrors.pivot_enu_m)
+    total, count = np.zeros((n_mirror, 2, 2)), np.zeros(n_mirror)
+    rng = np.random.default_rng(stream)
+    batch = max(1, _BATCH_RANGES // plan.thermal_m.size)
+    for begin in range(0, n_draw, batch):
+        world = World(plan, min(batch, n_draw - begin), rng)
+        for source in sources:
+            source.disturb(world)
+        error = world.normal_errors()
+        good = np.isfinite(error).all(axis=2)
+        error = np.where(good[..., None], error, 0.0)
+        total += np.einsum("dma,dmb->mab", error, error)
+        count += good.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return total / np.where(count > 0, count, np.nan)[:, None, None], int(n_draw * n_mirror - count.sum())
+
+
+def _line(
+    name: str, assumed: str, remedy: str, linear: FloatArray, drawn: FloatArray, to_target: FloatArray
+) -> BudgetLine:
+    def normal(cov: FloatArray) -> FloatArray:
+        return read_only(np.sqrt(np.trace(cov, axis1=1, axis2=2)))
+
+    def target(cov: FloatArray) -> FloatArray:
+        return read_only(np.sqrt(np.einsum("mxa,mab,mxb->m", to_target, cov, to_target)))
+
+    return BudgetLine(
+        name=name,
+        assumed=assumed,
+        remedy=remedy,
+        normal_rad=normal(linear),
+        target_m=target(linear),
+        drawn_normal_rad=normal(drawn),
+        drawn_target_m=target(drawn),
+    )
