@@ -1,0 +1,390 @@
+"""A layout that is being edited: the field's map after every move, fast enough to drag a transmitter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+from rfpose.checks import FloatArray
+from rfpose.errors import GeometryError, RfposeError, ScenarioError
+from rfpose.geometry import enu_from_azimuth_elevation
+from rfpose.layout import maps
+from rfpose.layout.fields import radial_staggered, read_positions
+from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
+from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
+from rfpose.multilat import check_unambiguous
+from rfpose.scenario import Scenario, Transmitter
+
+__all__ = [
+    "ESTIMATOR_NAMES",
+    "OPTIMISED",
+    "LayoutChoice",
+    "LiveLayout",
+    "LiveMap",
+    "Postures",
+    "SunPlace",
+    "field_from_csv",
+    "field_of",
+    "free_carrier_hz",
+    "place_transmitters",
+    "scenario_of_layout",
+    "staggered_field",
+    "sun_of",
+]
+
+ESTIMATOR_NAMES: tuple[str, ...] = tuple(ESTIMATORS)
+OPTIMISED: tuple[str, ...] = tuple(CRITERIA)
+Postures = Literal["scenario", "sun", "level"]
+_CARRIER_TRIES = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SunPlace:
+    """Where the sun stands [degrees]; azimuth from north, clockwise."""
+
+    azimuth_deg: float
+    elevation_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayoutChoice:
+    """What the map is made for.
+
+    Attributes
+    ----------
+    estimator
+        One of `ESTIMATOR_NAMES`.
+    tones
+        Which of the scenario's tones count; empty: all.
+    posture
+        ``scenario``: each heliostat's own normal, level without one. ``sun``: the sun onto the aim point. ``level``.
+    sun
+        For posture ``sun``.
+    per_tower, per_height_m, per_cable_m
+        Cost of a tower, of a metre of height, of a metre of cable.
+    """
+
+    estimator: str = "rigid"
+    tones: tuple[int, ...] = ()
+    posture: Postures = "scenario"
+    sun: SunPlace = SunPlace(azimuth_deg=180.0, elevation_deg=45.0)
+    per_tower: float = 1.0
+    per_height_m: float = 0.0
+    per_cable_m: float = 0.0
+
+    @property
+    def costs(self) -> Costs:
+        """The same for the optimiser."""
+        return Costs(per_tower=self.per_tower, per_height_m=self.per_height_m, per_cable_m=self.per_cable_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveMap:
+    """The field at one moment of editing.
+
+    Attributes
+    ----------
+    sigma_mrad : (heliostat,)
+        Bound of each normal, RMS angle; NaN where undetermined [mrad of the normal].
+    rms_mrad, median_mrad, worst_mrad
+        Over the determined mirrors; NaN where there are none.
+    worst
+        Index of the worst mirror; None where there is none.
+    undetermined
+        Mirrors without a bound.
+    cost
+        Of all towers.
+    problem
+        Why there is no map, in words; else empty.
+    """
+
+    sigma_mrad: FloatArray
+    rms_mrad: float
+    median_mrad: float
+    worst_mrad: float
+    worst: int | None
+    undetermined: int
+    cost: float
+    problem: str = ""
+
+
+def field_of(scenario: Scenario) -> FloatArray:
+    """Return the scenario's pivots (heliostat, xyz) [m]."""
+    return scenario.pivot_enu_m
+
+
+def field_from_csv(path: str | Path) -> FloatArray:
+    """Return pivots (heliostat, xyz) from a table; see `rfpose.layout.fields.read_positions`."""
+    return read_positions(path)[1]
+
+
+def staggered_field(n_heliostat: int, *, first_radius_m: float, diagonal_m: float, height_m: float) -> FloatArray:
+    """Return a radially staggered field (heliostat, xyz) about the origin [m]."""
+    return radial_staggered(n_heliostat, first_radius_m=first_radius_m, diagonal_m=diagonal_m, height_m=height_m)
+
+
+def sun_of(scenario: Scenario, moment: datetime) -> SunPlace:
+    """Return where the sun stands over a scenario's site.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario does not say where the site is.
+    """
+    from rfpose.feedback.sun import Site, sun_position, unix_seconds
+
+    place = scenario.site
+    if place.latitude_deg is None or place.longitude_deg is None:
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no place on Earth: add `latitude_deg` and `longitude_deg` to [site], or "
+            "set the sun's azimuth and elevation by hand"
+        )
+    site = Site(
+        latitude_rad=np.radians(place.latitude_deg),
+        longitude_rad=np.radians(place.longitude_deg),
+        altitude_m=place.height_m,
+    )
+    sun = sun_position(unix_seconds([moment]), site)
+    return SunPlace(
+        azimuth_deg=float(np.degrees(sun.azimuth_rad[0])), elevation_deg=float(np.degrees(sun.elevation_rad[0]))
+    )
+
+
+class LiveLayout:
+    """Maps of one field under one choice; make another when the choice or the field changes.
+
+    Parameters
+    ----------
+    scenario
+        Radio plan, mirrors, calibration receivers. Its transmitters are not used.
+    choice
+        See there.
+    pivot_enu_m : (heliostat, xyz), optional
+        Another field, with the mirror of the scenario's first heliostat [m].
+
+    Raises
+    ------
+    ScenarioError, GeometryError
+        No heliostat whose mirror could be taken; a posture that cannot be had; heliostats at one place.
+    """
+
+    def __init__(self, scenario: Scenario, choice: LayoutChoice, *, pivot_enu_m: FloatArray | None = None) -> None:
+        self.choice = choice
+        self._estimator = ESTIMATORS[choice.estimator]
+        self._bare = _bare(scenario, choice.tones)
+        self._n = len(scenario.heliostat) if pivot_enu_m is None else len(pivot_enu_m)
+        self._field = _mirrors(scenario, choice, pivot_enu_m) if self._n else None
+
+    @property
+    def pivot_enu_m(self) -> FloatArray:
+        """(heliostat, xyz) [m]."""
+        return np.empty((0, 3)) if self._field is None else self._field.pivot_enu_m
+
+    @property
+    def field(self) -> Mirrors | None:
+        """The mirrors in their posture; None where there are none."""
+        return self._field
+
+    def evaluate(self, transmitters: Sequence[Transmitter]) -> LiveMap:
+        """Return the map for these transmitters; what cannot be mapped says why."""
+        cost = self.choice.costs.of(np.array([t.position_enu_m for t in transmitters]).reshape(-1, 3))
+        if self._field is None:
+            return self._nothing(cost, "the field has no heliostats; add some to the scenario, or load a field")
+        try:
+            site = _with_transmitters(self._bare, transmitters)
+            maps.check_site(site.transmitter_enu_m)
+            check_unambiguous(site.transmitter_enu_m, site.wavelength_m)
+            noise = maps.noise_of(site)
+            sigma = 1e3 * maps.normal_map(site.transmitter_enu_m, self._field, noise, self._estimator)
+        except RfposeError as error:
+            return self._nothing(cost, str(error))
+        summary = summarise(sigma)
+        known = np.isfinite(sigma)
+        return LiveMap(
+            sigma_mrad=sigma,
+            rms_mrad=summary["rms"],
+            median_mrad=summary["median"],
+            worst_mrad=summary["worst"],
+            worst=int(np.nanargmax(sigma)) if known.any() else None,
+            undetermined=int(len(sigma) - known.sum()),
+            cost=cost,
+        )
+
+    def _nothing(self, cost: float, why: str) -> LiveMap:
+        nan = float("nan")
+        return LiveMap(
+            sigma_mrad=np.full(self._n, np.nan),
+            rms_mrad=nan,
+            median_mrad=nan,
+            worst_mrad=nan,
+            worst=None,
+            undetermined=self._n,
+            cost=cost,
+            problem=why,
+        )
+
+
+def _bare(scenario: Scenario, tones: Sequence[int]) -> dict[str, Any]:
+    """Return the scenario as data, without heliostats: quick to check after each move."""
+    data = scenario.model_dump(exclude_none=True)
+    data["heliostat"] = ()
+    data.get("simulation", {}).pop("blocked", None)
+    data.get("simulation", {}).pop("dropped", None)
+    if tones:
+        data["tone"] = tuple(data["tone"][i] for i in tones)
+    return data
+
+
+def _with_transmitters(bare: dict[str, Any], transmitters: Sequence[Transmitter]) -> Scenario:
+    try:
+        return Scenario.model_validate({**bare, "transmitter": [t.model_dump() for t in transmitters]})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        reason = first["msg"].removeprefix("Value error, ")
+        raise ScenarioError(f"`{place}`: {reason}" if place else reason) from error
+
+
+def _mirrors(scenario: Scenario, choice: LayoutChoice, pivot_enu_m: FloatArray | None) -> Mirrors:
+    if choice.posture == "sun" and scenario.site.aim_enu_m is None:
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no aim point: add `aim_enu_m` to [site], or choose another posture"
+        )
+    sun = None
+    if choice.posture == "sun":
+        if choice.sun.elevation_deg <= 0.0:
+            raise ScenarioError(
+                f"the sun is {-choice.sun.elevation_deg:.1f}° below the horizon; choose another time of day"
+            )
+        sun = enu_from_azimuth_elevation(np.radians(choice.sun.azimuth_deg), np.radians(choice.sun.elevation_deg))
+    level = np.array([0.0, 0.0, 1.0]) if choice.posture == "level" else None
+    if pivot_enu_m is None:
+        return maps.mirrors_of(scenario, normal_enu=level, sun_enu=sun)
+    if not scenario.heliostat:
+        raise ScenarioError(f"scenario `{scenario.name}` has no heliostat whose mirror the field could have; add one")
+    like = scenario.heliostat[0]
+    normal = level if level is not None else np.array(like.normal_enu or (0.0, 0.0, 1.0))
+    return maps.mirrors_facing(
+        pivot_enu_m,
+        np.array(like.receiver_mirror_m),
+        normal_enu=None if sun is not None else normal,
+        aim_enu_m=scenario.site.aim_enu_m,
+        sun_enu=sun,
+        arm_m=like.arm_m,
+    )
+
+
+def free_carrier_hz(scenario: Scenario, transmitters: Sequence[Transmitter]) -> float:
+    """Return a carrier in the band whose lines stay farthest from those of the transmitters.
+
+    Raises
+    ------
+    ScenarioError
+        The band has no room.
+    """
+    radio = scenario.radio
+    half = 0.5 * radio.sample_rate_hz
+    margin = radio.clock_search_ppm * 1e-6 * (radio.centre_frequency_hz + half)
+    usable = half - 1.01 * margin - float(scenario.tone_hz.max())
+    offset = np.concatenate([[0.0], scenario.tone_hz, -scenario.tone_hz])
+    taken = (np.array([t.carrier_hz for t in transmitters])[:, None] + offset).ravel()
+    if not len(taken):
+        return 0.0
+    candidate = np.linspace(-usable, usable, _CARRIER_TRIES)
+    gap = np.abs(candidate[:, None, None] + offset[:, None] - taken).min(axis=(1, 2))
+    best = int(np.argmax(gap))
+    if usable <= 0.0 or gap[best] < 2.0 * radio.sample_rate_hz / radio.frame_samples:
+        raise ScenarioError(
+            "the band has no room for another carrier; raise `radio.sample_rate_hz`, or remove a transmitter"
+        )
+    return float(candidate[best])
+
+
+def scenario_of_layout(
+    scenario: Scenario, transmitters: Sequence[Transmitter], *, pivot_enu_m: FloatArray | None = None
+) -> Scenario:
+    """Return the scenario with these transmitters, and with another field if one is given; checked.
+
+    Raises
+    ------
+    ScenarioError
+        The layout contradicts itself; the message points to the key.
+    """
+    data = scenario.model_dump(exclude_none=True)
+    kept = {t.id for t in transmitters}
+    simulation = data.get("simulation", {})
+    if simulation.get("blocked"):
+        simulation["blocked"] = [b for b in simulation["blocked"] if b["transmitter"] in kept]
+    if pivot_enu_m is not None:
+        like = scenario.heliostat[0].model_dump(exclude_none=True)
+        like.pop("normal_enu", None)
+        n_receiver = len(scenario.heliostat[0].receiver_mirror_m)
+        data["heliostat"] = [
+            {
+                **like,
+                "id": f"H{k + 1}",
+                "pivot_enu_m": tuple(place),
+                "receiver_ids": [f"H{k + 1}_r{i}" for i in range(n_receiver)],
+            }
+            for k, place in enumerate(np.asarray(pivot_enu_m).tolist())
+        ]
+        simulation.pop("blocked", None)
+        simulation.pop("dropped", None)
+    return _with_transmitters(data, transmitters)
+
+
+def place_transmitters(
+    layout: LiveLayout,
+    transmitters: Sequence[Transmitter],
+    locked: Sequence[bool],
+    *,
+    criterion: Criterion = "pdop",
+    statistic: str = "rms",
+    separation_m: float = 0.0,
+    starts: int = 10,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> tuple[Transmitter, ...]:
+    """Return the transmitters with those that are not locked moved to where the field is known best.
+
+    They stay within the circle about the origin, and between the heights, that all of them span now.
+
+    Raises
+    ------
+    GeometryError
+        Everything is locked; no field; no layout meets the limits.
+    """
+    if layout.field is None:
+        raise GeometryError("the field has no heliostats; add some to the scenario, or load a field")
+    if all(locked):
+        raise GeometryError("every transmitter is locked; unlock those that may move")
+    places = np.array([t.position_enu_m for t in transmitters], np.float64)
+    held = np.array(locked, bool)
+    found = optimise(
+        len(places),
+        layout.field,
+        Constraints(
+            allowed=(Zone(radius_m=max(float(np.hypot(places[:, 0], places[:, 1]).max()), 1.0)),),
+            height_m=(float(places[:, 2].min()), float(places[:, 2].max())),
+            separation_m=separation_m,
+        ),
+        criterion=criterion,
+        statistic=statistic,
+        existing_enu_m=places[held] if held.any() else None,
+        costs=layout.choice.costs,
+        starts=starts,
+        seed=seed,
+        also_from=[places[~held]],
+        progress=on_progress,
+    )
+    moved = iter(found.transmitter_enu_m[int(held.sum()) :].tolist())
+    return tuple(
+        t if hold else t.model_copy(update={"position_enu_m": tuple(next(moved))})
+        for t, hold in zip(transmitters, held, strict=True)
+    )
