@@ -1,7 +1,7 @@
 """What an error of each range does to each normal: the linear estimator itself, not only its covariance.
 
-`rfpose.layout.maps` needs the covariance alone and takes short cuts to it. A budget, and the question what a wrong survey
-does, need the estimator: the derivative of the solved normal by every range and every prior that enters it.
+`rfpose.layout.maps` needs the covariance alone and takes short cuts to it. A budget, and the question what a wrong
+survey does, need the estimator: the derivative of the solved normal by every range and every prior that enters it.
 """
 
 from __future__ import annotations

@@ -371,10 +371,16 @@ def _plane_slope(receiver_mirror_m: FloatArray) -> FloatArray:
 
 
 def normal_without_each(
-    transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, estimator: Estimator
+    transmitter_enu_m: npt.ArrayLike,
+    mirrors: Mirrors,
+    noise: Noise,
+    estimator: Estimator,
+    *,
+    visible: npt.ArrayLike | None = None,
 ) -> FloatArray:
     """Return the bound of each mirror's normal with each transmitter lost in turn (transmitter, mirror) [rad]."""
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+    seen = None if visible is None else np.asarray(visible)
     rows = []
     for lost in range(len(transmitter)):
         left = np.arange(len(transmitter)) != lost
@@ -385,7 +391,8 @@ def normal_without_each(
             carrier_sigma_m=None if carrier is None else np.ascontiguousarray(carrier[left]),
             reference_range_m=noise.reference_range_m,
         )
-        rows.append(normal_map(transmitter[left], mirrors, fewer, estimator))
+        rest = None if seen is None else seen[..., left]
+        rows.append(normal_map(transmitter[left], mirrors, fewer, estimator, visible=rest))
     return np.array(rows)
 
 
@@ -504,7 +511,7 @@ def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
     """Return the noise that a scenario's radio plan allows: each phase at its Cramér–Rao bound.
 
     Tones: σ_φ = 1/√(n·snr), snr = (a m)²/σ² as `[simulation] tone_snr_db` counts it. Carrier: σ = 1/√(2n)·σ/a.
-    Calibration: the mean of all calibration receivers, each with its noise and the survey of its place.
+    Calibration: all calibration receivers, weighed by their noise and the survey of their places.
 
     Parameters
     ----------
@@ -532,7 +539,7 @@ def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
         loss = distance / plan.reference_range_m if free else np.ones_like(distance)
         survey = np.array([r.survey_sigma_m for r in scenario.calibration_receiver])
         variance = (tone[:, None] * loss) ** 2 + survey[:, None] ** 2
-        calibration = np.sqrt(variance.mean(axis=1) / len(survey))
+        calibration = (variance**-1.0).sum(axis=1) ** -0.5
     return Noise(
         tone_sigma_m=read_only(tone),
         calibration_sigma_m=read_only(calibration),

@@ -74,7 +74,7 @@ class Plan:
     @property
     def sigma_m(self) -> FloatArray:
         """(mirror, group, receiver, transmitter) own noise that the solver assumes [m]."""
-        return self.thermal_m * np.sqrt(1.0 + self.converter_share)
+        return np.asarray(self.thermal_m * np.sqrt(1.0 + self.converter_share))
 
     @property
     def survey_sigma_m(self) -> FloatArray:
@@ -266,7 +266,7 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
 
 
 def _estimator(scenario: Scenario, pose: str) -> Estimator:
-    """The solver's settings, as `rfpose process` takes them from a scenario."""
+    """Return the solver's settings, as `rfpose process` takes them from a scenario."""
     if not scenario.heliostat:
         raise GeometryError("the scenario has no heliostats; add some, or a field from CSV")
     if pose == "independent":
@@ -350,7 +350,7 @@ def _with_trusted_groups(plan: Plan) -> Plan:
         start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
         knowledge=plan.knowledge(mirrors.pivot_enu_m),
     )
-    kept = solution.fixed.all(axis=0)
+    kept: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=0))
     tones = kept[plan.tone_hz > 0.0]
     return replace(
         plan,

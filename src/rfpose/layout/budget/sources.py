@@ -47,7 +47,7 @@ class Source(Protocol):
         """Return what is assumed, in words; empty where the site does not have this source."""
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
-        """Return first-order effects through (mirror, output, group, receiver, transmitter) and (mirror, output, xyz)."""
+        """Return what it does by slopes (mirror, output, group, receiver, transmitter) and (mirror, output, xyz)."""
 
     def disturb(self, world: World) -> None:
         """Draw this source's errors into the world."""
@@ -241,7 +241,7 @@ class ReceiverPlaces:
     """Places of the receivers on their mirror."""
 
     name = "receiver places"
-    remedy = "measure the receivers on the mirror better, or set them farther apart; constant for a mirror, so that a kinematic calibration takes it out"
+    remedy = "measure the receivers on the mirror better, set them farther apart; constant, so calibration takes it out"
 
     def assumed(self, plan: Plan) -> str:
         sigma_mm = 1e3 * plan.scenario.budget.receiver_mirror_sigma_m

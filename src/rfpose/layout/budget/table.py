@@ -80,7 +80,7 @@ def error_budget(
     """Return the budget of a site.
 
     Each source's slopes go through the estimator's gain: rms errors add as squares, sources being independent. With
-    draws, each line and the whole are also measured: exact ranges with errors, calibrated and solved by the solver itself.
+    draws, each line and the whole are also measured: exact ranges with errors, calibrated and solved by the solver.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def _draw(plan: Plan, sources: Sequence[Source], n_draw: int, stream: np.random.
         for source in sources:
             source.disturb(world)
         error = world.normal_errors()
-        good = np.isfinite(error).all(axis=2)
+        good: npt.NDArray[np.bool_] = np.asarray(np.isfinite(error).all(axis=2))
         error = np.where(good[..., None], error, 0.0)
         total += np.einsum("dma,dmb->mab", error, error)
         count += good.sum(axis=0)

@@ -7,6 +7,7 @@ through `solve_rigid`, `solve_with_ground` or `solve_poses`. Whole wavelengths c
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp.calibration import electronic_phase
@@ -75,10 +76,10 @@ class World:
 
     def normal(self, *shape: int) -> FloatArray:
         """Return standard normal numbers."""
-        return self.rng.standard_normal(shape)
+        return np.asarray(self.rng.standard_normal(shape))
 
     def normal_errors(self) -> FloatArray:
-        """Measure and solve: solved less true normals, along the mirrors' axes (draw, mirror, xy) [rad]; NaN = failed."""
+        """Measure and solve: (draw, mirror, xy) solved less true normals along the mirrors' axes [rad]; NaN failed."""
         normal = self._solve(self._measured())
         rot = self.plan.mirrors.rot_enu_from_mirror
         glass = np.concatenate([self.glass_tilt_rad, np.ones((*self.glass_tilt_rad.shape[:2], 1))], axis=2)
@@ -100,7 +101,7 @@ class World:
             weight * self._ranges(self._receivers(-time * self.turn_rate_rad_per_s))
             for time, weight in zip(before_s, _NODE_WEIGHTS, strict=True)
         ]
-        return np.sum(seen, axis=0) + self.range_m
+        return np.asarray(np.sum(seen, axis=0) + self.range_m)
 
     def _receivers(self, tilt_rad: FloatArray) -> FloatArray:
         """(draw, mirror, receiver, xyz) places of the receivers with the normal tilted along the mirror's axes."""
@@ -222,7 +223,8 @@ class World:
             min_probability=0.0,
             propagation_speed_mps=plan.scenario.radio.propagation_speed_mps,
         )
-        normal = np.where(solution.fixed.all(axis=1)[:, None], solution.poses.normal_enu, np.nan)
+        resolved: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=1))
+        normal = np.where(resolved[:, None], solution.poses.normal_enu, np.nan)
         return normal.reshape(n_draw, -1, 3)
 
     def _solve_independent(self, range_m: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,9 @@ from rfpose.layout.maps import Mirrors
 from rfpose.layout.sight import _kernels
 
 __all__ = ["Plates", "Tower", "discs_lit", "visible"]
+
+_HAIR = 1e-6
+"""Share of a plate's diagonal by which a flush receiver stands out of it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,15 +29,20 @@ class Plates:
         Along the mirror's x and y [m].
     arm_m
         [m].
+    flush
+        The side out of which a receiver looks that lies in the plate's own plane, within its outline.
     """
 
     width_m: float
     height_m: float
     arm_m: float = 0.0
+    flush: Literal["front", "back"] = "front"
 
     def __post_init__(self) -> None:
         as_positive("width_m", self.width_m)
         as_positive("height_m", self.height_m)
+        if self.flush not in ("front", "back"):
+            raise InvalidInputError(f"`flush` must be 'front' or 'back', got {self.flush!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,9 +73,9 @@ def visible(
 ) -> npt.NDArray[np.bool_]:
     """Return which transmitters each receiver sees (mirror, receiver, transmitter), by straight rays.
 
-    A receiver is where ``mirrors`` puts it: in front of its plate, behind it, or, outside the rectangle, beside it. One
-    that lies in the plate's own plane (an antenna flush with it) is not hidden by that plate from either side; put it a
-    little in front or behind. Edges are sharp: no diffraction.
+    A receiver is where ``mirrors`` puts it: in front of its plate, behind it, or, outside the rectangle, beside it,
+    where it looks both ways. One that lies in the plate (an antenna flush with it) looks out of the side that
+    ``plates`` says. Edges are sharp: no diffraction.
 
     Parameters
     ----------
@@ -78,7 +87,7 @@ def visible(
         See there.
     """
     transmitter = np.array(as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3)))
-    receiver = mirrors.receiver_enu_m
+    receiver = _lifted(mirrors, plates)
     centre = mirrors.pivot_enu_m + plates.arm_m * mirrors.normal_enu
     half_x, half_y = 0.5 * plates.width_m, 0.5 * plates.height_m
     reach = float(np.hypot(half_x, half_y))
@@ -95,6 +104,16 @@ def visible(
         float(centre[:, 2].max() + reach), cylinder, float(origin[0]), float(origin[1]), cell, start, member, out,
     )  # fmt: skip
     return out.astype(np.bool_)
+
+
+def _lifted(mirrors: Mirrors, plates: Plates) -> FloatArray:
+    """(mirror, receiver, xyz) places of the receivers, those within a plate a hair's breadth out of it [m]."""
+    hair = _HAIR * float(np.hypot(plates.width_m, plates.height_m))
+    place = mirrors.receiver_mirror_m
+    inside = (np.abs(place[..., 0]) < 0.5 * plates.width_m) & (np.abs(place[..., 1]) < 0.5 * plates.height_m)
+    flush = inside & (np.abs(place[..., 2] - plates.arm_m) < hair)
+    offset = np.where(flush, hair if plates.flush == "front" else -hair, 0.0)
+    return np.asarray(mirrors.receiver_enu_m + offset[..., None] * mirrors.normal_enu[:, None])
 
 
 def _cells(centre: FloatArray, origin: FloatArray, cell: float) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -1,0 +1,55 @@
+"""What the studies share: which field, in which postures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.layout.site import Postures
+
+__all__ = ["CRITERIA", "ESTIMATORS", "field_options", "postures"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# names only, since the modules that define them load numpy
+ESTIMATORS = ("independent", "rigid", "shared-clock", "carrier", "pivot")
+CRITERIA = ("pdop", "independent", "rigid", "shared-clock")
+
+
+def field_options(function: F) -> F:
+    """Add ``--field``, ``--sun``, ``--day``, ``--year`` and ``--stow``; `postures` reads the last four."""
+    options = (
+        click.option("--stow", is_flag=True, help="Also the stow posture, face up."),
+        click.option(
+            "--year", type=click.IntRange(min=1900), help="Every hour of the 21st of each month, sun above 5°."
+        ),
+        click.option("--day", type=click.DateTime(["%Y-%m-%d"]), help="Every half hour of this day, sun above 5°."),
+        click.option(
+            "--sun",
+            "suns",
+            type=(float, float),
+            multiple=True,
+            metavar="AZ EL",
+            help="Mirrors reflect this sun onto the aim point [deg]; repeat for several.",
+        ),
+        click.option(
+            "--field",
+            type=click.Path(path_type=Path),
+            help="CSV of heliostats (east_m, north_m) instead of the scenario's.",
+        ),
+    )
+    for option in options:
+        function = option(function)
+    return function
+
+
+def postures(suns: tuple[tuple[float, float], ...], day: datetime | None, year: int | None, stow: bool) -> Postures:
+    """Return the postures that the options name."""
+    from rfpose.pipeline.layout.site import Postures
+
+    return Postures(suns_deg=suns, day=None if day is None else day.date(), year=year, stow=stow)

@@ -1,0 +1,198 @@
+"""``rfpose layout optimise``: where transmitters should stand, and what more of them would buy."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rfpose.cli._support import (
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    progress,
+    say,
+    table,
+    wants_json,
+)
+from rfpose.cli.layout._options import CRITERIA, field_options, postures
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.layout import Rules
+
+__all__ = ["command"]
+
+
+class _Counts(click.ParamType[range]):
+    """Numbers of transmitters as ``6..12``."""
+
+    name = "counts"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
+        """Return the numbers, both ends included."""
+        if isinstance(value, range):
+            return value
+        first, dots, last = str(value).partition("..")
+        try:
+            counts = range(int(first), int(last if dots else first) + 1)
+        except ValueError:
+            counts = range(0)
+        if not counts:
+            self.fail(f"{value!r} is no range such as 6..12", param, ctx)
+        return counts
+
+
+_CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "metavar": "X Y R"}
+
+
+@click.command(
+    name="optimise",
+    epilog=examples(
+        "rfpose layout optimise site.toml -o better.toml",
+        "rfpose layout optimise site.toml -o better.toml -n 8 --minimise rigid --statistic p95 --height 15 40",
+        "rfpose layout optimise site.toml --pareto 6..12 --cost 10000 200 30 --csv curve.csv --picture curve.png",
+    ),
+)
+@click.argument("scenario", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the scenario with the new places.")
+@click.option("-n", "--transmitters", type=click.IntRange(min=1), help="How many; default: as many as there are.")
+@click.option("--pareto", type=_Counts(), metavar="N1..N2", help="Instead, the best of each number: cost and accuracy.")
+@click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="With --pareto: one row a number.")
+@click.option("--picture", type=click.Path(path_type=Path), help="With --pareto: PNG or SVG.")
+@click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True)
+@click.option("--statistic", default="rms", show_default=True, help="rms, worst, or a percentile such as p95.")
+@click.option("--radius", type=float, help="Farthest from the origin [m]; default: the farthest transmitter now.")
+@click.option("--outline", type=click.Path(path_type=Path), help="CSV of the allowed ground's corners, for --radius.")
+@click.option("--allow", **_CIRCLE, help="Further ground that may be used: a circle [m].")
+@click.option("--exclude", **_CIRCLE, help="Circle kept free [m].")
+@click.option("--height", type=(float, float), metavar="LOW HIGH", help="Antenna heights [m]; default: those now.")
+@click.option("--separation", type=float, help="Least distance of two towers [m]; default: a twentieth of the radius.")
+@click.option("--clearance", type=float, default=0.0, show_default=True, help="Least distance to heliostats [m].")
+@click.option("--keep", type=click.IntRange(min=0), default=0, show_default=True, help="The first so many stay.")
+@click.option("--cost", type=(float, float, float), default=(1.0, 0.0, 0.0), metavar="TOWER HEIGHT CABLE",
+              help="Cost of a tower, of a metre of height, of a metre of cable.")  # fmt: skip
+@click.option("--starts", type=click.IntRange(min=1), default=30, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@field_options
+@force_option
+@common_options
+def command(
+    scenario: Path,
+    output: Path | None,
+    transmitters: int | None,
+    pareto: range | None,
+    csv_path: Path | None,
+    picture: Path | None,
+    minimise: str,
+    statistic: str,
+    cost: tuple[float, float, float],
+    starts: int,
+    seed: int,
+    field: Path | None,
+    suns: tuple[tuple[float, float], ...],
+    day: datetime | None,
+    year: int | None,
+    stow: bool,
+    force: bool,
+    **where: Any,
+) -> None:
+    """Place the transmitters anew, for the best accuracy that the limits allow."""
+    from rfpose.layout.optimise import Costs
+    from rfpose.pipeline.files import refuse_existing
+
+    if pareto is not None and (output is not None or transmitters is not None):
+        raise click.UsageError("--pareto compares numbers of transmitters; give -o and -n without it")
+    if pareto is None and (csv_path is not None or picture is not None):
+        raise click.UsageError("--csv and --picture go with --pareto")
+    for path in (output, csv_path, picture):
+        if path is not None:
+            refuse_existing(path, force=force)
+    settings: dict[str, Any] = {
+        "criterion": minimise,
+        "statistic": statistic,
+        "rules": _rules(**where),
+        "costs": Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
+        "postures": postures(suns, day, year, stow),
+        "field_csv": field,
+        "starts": starts,
+        "seed": seed,
+    }
+    if pareto is not None:
+        _compare(scenario, pareto, settings, csv_path, picture)
+        return
+    _place(scenario, transmitters, settings, output)
+
+
+def _rules(
+    radius: float | None,
+    outline: Path | None,
+    allow: tuple[tuple[float, float, float], ...],
+    exclude: tuple[tuple[float, float, float], ...],
+    height: tuple[float, float] | None,
+    separation: float | None,
+    clearance: float,
+    keep: int,
+) -> Rules:
+    from rfpose.pipeline.layout import Rules
+
+    return Rules(
+        radius_m=radius,
+        outline_csv=outline,
+        allowed_m=allow,
+        excluded_m=exclude,
+        height_m=height,
+        separation_m=separation,
+        clearance_m=clearance,
+        keep=keep,
+    )
+
+
+def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None) -> None:
+    from rfpose.pipeline.files import write_atomically
+    from rfpose.pipeline.layout import optimise_layout
+
+    with progress("Searching") as on_progress:
+        found = optimise_layout(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
+    if output is not None:
+        write_atomically(output, found.scenario.to_toml().encode())
+    summary = found.as_dict()
+    if wants_json():
+        emit_json({**summary, "output": output})
+        return
+    unit = f" {summary['unit']}".rstrip()
+    name = f"{summary['criterion']} {summary['statistic']}"
+    say(f"{name}: {summary['value']:.4g}{unit}, was {summary['before']:.4g}{unit}")
+    say(f"without its most needed transmitter: {summary['without_worst']:.4g}{unit}; cost {summary['cost']:g}")
+    say(f"PDOP rms: {summary['pdop_rms']:.4g}, was {summary['pdop_rms_before']:.4g}")
+    places = [[name, *(f"{x:.3f}" for x in place)] for name, place in summary["transmitters"].items()]
+    table("Transmitters [m]", ["", "east", "north", "up"], places)
+
+
+def _compare(
+    scenario: Path, counts: range, settings: dict[str, Any], csv_path: Path | None, picture: Path | None
+) -> None:
+    from rfpose.pipeline.layout import draw_placements, pareto_layout, write_placements_csv
+
+    with progress("Searching, number by number") as on_progress:
+        curve = pareto_layout(scenario, counts, on_progress=on_progress, **settings)
+    if csv_path is not None:
+        write_placements_csv(curve, csv_path)
+    if picture is not None:
+        draw_placements(curve, picture)
+    summary = curve.as_dict()
+    if wants_json():
+        emit_json({**summary, "csv": csv_path, "picture": picture})
+        return
+    unit = f" [{summary['unit']}]" if summary["unit"] else ""
+    table(
+        f"{summary['criterion']}, {summary['statistic']} over the field{unit}",
+        ["transmitters", "cost", "all", "worst one lost", "efficient"],
+        [
+            [str(row["transmitters"]), *(f"{row[key]:.4g}" for key in ("cost", "value", "without_worst")),
+             "yes" if row["efficient"] else "no"]
+            for row in summary["placements"]
+        ],
+    )  # fmt: skip

@@ -1,0 +1,346 @@
+"""Better places for a scenario's transmitters, and what more of them would buy."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfpose.checks import FloatArray
+from rfpose.errors import GeometryError, ScenarioError
+from rfpose.layout import maps
+from rfpose.layout.fields import read_positions
+from rfpose.layout.maps import Mirrors
+from rfpose.layout.optimise import (
+    Constraints,
+    Costs,
+    Criterion,
+    Placement,
+    Zone,
+    evaluate_placement,
+    optimise,
+    pareto,
+    scenario_with,
+)
+from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.layout.site import Postures, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.pictures import _new_figure, _save
+from rfpose.scenario import Scenario
+
+__all__ = [
+    "Rules",
+    "SitePlacement",
+    "SitePlacements",
+    "draw_placements",
+    "optimise_layout",
+    "pareto_layout",
+    "write_placements_csv",
+]
+
+_SEPARATION = 0.05
+"""Towers keep this share of the radius from each other, unless told otherwise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rules:
+    """Where towers may stand, for `optimise_layout`; all [m].
+
+    Attributes
+    ----------
+    radius_m, height_m
+        Circle about the origin, and antenna heights; by default those that the scenario's transmitters use.
+    outline_csv
+        Corners of the allowed ground instead of the circle (columns ``east_m``, ``north_m``).
+    allowed_m, excluded_m
+        Circles (x, y, radius): further ground that may be used, and ground that must not.
+    separation_m
+        Between towers; default: a twentieth of the radius, since a rigid mirror's optimum would stack them.
+    clearance_m
+        To heliostats.
+    keep
+        The scenario's first so many transmitters stay where they are.
+    """
+
+    radius_m: float | None = None
+    height_m: tuple[float, float] | None = None
+    outline_csv: str | Path | None = None
+    allowed_m: Sequence[tuple[float, float, float]] = ()
+    excluded_m: Sequence[tuple[float, float, float]] = ()
+    separation_m: float | None = None
+    clearance_m: float = 0.0
+    keep: int = 0
+
+    def constraints(self, transmitter_enu_m: FloatArray) -> Constraints:
+        """Return the rules with defaults taken from the transmitters as they stand."""
+        own_radius = float(np.hypot(transmitter_enu_m[:, 0], transmitter_enu_m[:, 1]).max())
+        radius = own_radius if self.radius_m is None else self.radius_m
+        heights = (float(transmitter_enu_m[:, 2].min()), float(transmitter_enu_m[:, 2].max()))
+        ground = Zone(radius_m=radius)
+        if self.outline_csv is not None:
+            ground = Zone(corner_enu_m=read_positions(self.outline_csv)[1][:, :2])
+        return Constraints(
+            allowed=(ground, *(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.allowed_m)),
+            height_m=heights if self.height_m is None else self.height_m,
+            excluded=tuple(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.excluded_m),
+            separation_m=_SEPARATION * radius if self.separation_m is None else self.separation_m,
+            clearance_m=self.clearance_m,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SitePlacement:
+    """Transmitters placed anew: the placement, the scenario with it, and what it was before."""
+
+    placement: Placement
+    scenario: Scenario
+    before: float
+    before_pdop: float
+    after_pdop: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the placement with stable keys; angles in mrad of the normal."""
+        found = self.placement
+        factor = _factor(found)
+        return {
+            "criterion": found.criterion,
+            "statistic": found.statistic,
+            "unit": "" if found.criterion == "pdop" else "mrad",
+            "value": factor * found.value,
+            "before": factor * self.before,
+            "without_worst": factor * found.lost_one,
+            "pdop_rms": self.after_pdop,
+            "pdop_rms_before": self.before_pdop,
+            "cost": found.cost,
+            "searches": len(found.start_value),
+            "searches_failed": int(np.isnan(found.start_value).sum()),
+            "transmitters": {t.id: list(t.position_enu_m) for t in self.scenario.transmitter},
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SitePlacements:
+    """The best placement for each number of transmitters, and whether none beats it in cost, accuracy and loss."""
+
+    scenario: Scenario
+    found: tuple[tuple[Placement, bool], ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the curve with stable keys; angles in mrad of the normal."""
+        first = self.found[0][0]
+        return {
+            "criterion": first.criterion,
+            "statistic": first.statistic,
+            "unit": "" if first.criterion == "pdop" else "mrad",
+            "placements": [
+                {
+                    "transmitters": len(p.transmitter_enu_m),
+                    "cost": p.cost,
+                    "value": _factor(p) * p.value,
+                    "without_worst": _factor(p) * p.lost_one,
+                    "efficient": free,
+                    "positions_enu_m": p.transmitter_enu_m.tolist(),
+                }
+                for p, free in self.found
+            ],
+        }
+
+
+def _factor(placement: Placement) -> float:
+    return 1.0 if placement.criterion == "pdop" else 1e3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Task:
+    """A scenario made ready for placement."""
+
+    scenario: Scenario
+    field: Mirrors
+    constraints: Constraints
+    sigma_m: float
+
+
+def _task(
+    scenario_path: str | Path,
+    rules: Rules,
+    criterion: Criterion,
+    postures: Postures,
+    field_csv: str | Path | None,
+) -> _Task:
+    scenario = load_site(scenario_path, field_csv)
+    now = scenario.transmitter_enu_m
+    if not 0 <= rules.keep <= len(now):
+        raise ScenarioError(f"{scenario_path}: cannot keep {rules.keep} transmitters, the scenario has {len(now)}")
+    return _Task(
+        scenario=scenario,
+        field=stacked([p.mirrors for p in postures_of(scenario, postures, scenario_path)]),
+        constraints=rules.constraints(now),
+        sigma_m=1.0 if criterion == "pdop" else _sigma_m(scenario),
+    )
+
+
+def optimise_layout(
+    scenario_path: str | Path,
+    *,
+    n_transmitter: int | None = None,
+    criterion: Criterion = "pdop",
+    statistic: str = "rms",
+    rules: Rules | None = None,
+    costs: Costs | None = None,
+    suns_deg: Sequence[Sun] = (),
+    postures: Postures | None = None,
+    field_csv: str | Path | None = None,
+    starts: int = 30,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> SitePlacement:
+    """Place a scenario's transmitters anew for its heliostats; see `rfpose.layout.optimise.optimise`.
+
+    Parameters
+    ----------
+    n_transmitter
+        As many as the scenario has, by default.
+    rules
+        Where they may stand.
+    suns_deg, postures
+        As in `map_layout`.
+
+    Raises
+    ------
+    ScenarioError
+        As `map_layout`; constraints that cannot be met.
+    """
+    rules = rules or Rules()
+    task = _task(scenario_path, rules, criterion, postures or Postures(suns_deg=suns_deg), field_csv)
+    now = task.scenario.transmitter_enu_m
+    try:
+        found = optimise(
+            n_transmitter or len(now),
+            task.field,
+            task.constraints,
+            criterion=criterion,
+            statistic=statistic,
+            existing_enu_m=now[: rules.keep] if rules.keep else None,
+            costs=costs,
+            sigma_m=task.sigma_m,
+            starts=starts,
+            seed=seed,
+            progress=on_progress,
+        )
+        better = scenario_with(task.scenario, found.transmitter_enu_m, n_existing=rules.keep)
+    except GeometryError as error:
+        raise ScenarioError(f"{scenario_path}: {error}") from error
+    return SitePlacement(
+        placement=found,
+        scenario=better,
+        before=evaluate_placement(now, task.field, criterion=criterion, statistic=statistic, sigma_m=task.sigma_m),
+        before_pdop=evaluate_placement(now, task.field),
+        after_pdop=evaluate_placement(found.transmitter_enu_m, task.field),
+    )
+
+
+def pareto_layout(
+    scenario_path: str | Path,
+    counts: Sequence[int],
+    *,
+    criterion: Criterion = "pdop",
+    statistic: str = "rms",
+    rules: Rules | None = None,
+    costs: Costs | None = None,
+    postures: Postures | None = None,
+    field_csv: str | Path | None = None,
+    starts: int = 30,
+    seed: int = 0,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> SitePlacements:
+    """Place several numbers of transmitters: cost, accuracy, and what is left when the worst one to lose is lost.
+
+    Parameters
+    ----------
+    counts
+        Numbers of transmitters, those kept included.
+    criterion, statistic, rules, costs, postures, field_csv, starts, seed
+        As in `optimise_layout`.
+
+    Raises
+    ------
+    ScenarioError
+        As `optimise_layout`.
+    """
+    rules = rules or Rules()
+    task = _task(scenario_path, rules, criterion, postures or Postures(), field_csv)
+    now = task.scenario.transmitter_enu_m
+    try:
+        found = pareto(
+            counts,
+            task.field,
+            task.constraints,
+            costs=costs,
+            progress=on_progress,
+            criterion=criterion,
+            statistic=statistic,
+            existing_enu_m=now[: rules.keep] if rules.keep else None,
+            sigma_m=task.sigma_m,
+            starts=starts,
+            seed=seed,
+        )
+    except GeometryError as error:
+        raise ScenarioError(f"{scenario_path}: {error}") from error
+    return SitePlacements(scenario=task.scenario, found=tuple(found))
+
+
+def _sigma_m(scenario: Scenario) -> float:
+    """Range noise of one transmitter of mean amplitude, all tones together [m]."""
+    tone = maps.noise_of(scenario).tone_sigma_m
+    return float(np.mean((tone**-2.0).sum(axis=0)) ** -0.5)
+
+
+def write_placements_csv(curve: SitePlacements, path: str | Path) -> None:
+    """Write one row a number of transmitters."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    summary = curve.as_dict()
+    unit = f"_{summary['unit']}" if summary["unit"] else ""
+    name = f"{summary['criterion']}_{summary['statistic']}"
+    writer.writerow(["transmitters", "cost", f"{name}{unit}", f"{name}_without_worst{unit}", "efficient"])
+    for row in summary["placements"]:
+        values = [f"{row[key]:.6g}" for key in ("cost", "value", "without_worst")]
+        writer.writerow([row["transmitters"], *values, int(row["efficient"])])
+    write_atomically(path, text.getvalue().encode())
+
+
+def draw_placements(curve: SitePlacements, path: str | Path) -> None:
+    """Draw accuracy, whole and with the worst transmitter lost, against number and cost of transmitters.
+
+    Raises
+    ------
+    InvalidInputError
+        ``path`` ends neither in .png nor in .svg.
+    """
+    summary = curve.as_dict()
+    rows = summary["placements"]
+    count = [row["transmitters"] for row in rows]
+    figure, axes = _new_figure(8.0, 5.4)
+    axes.plot(count, [row["value"] for row in rows], "o-", color="#0072B2", label="all transmitters")
+    lost = np.array([row["without_worst"] for row in rows], np.float64)
+    axes.plot(count, np.where(np.isfinite(lost), lost, np.nan), "s--", color="#D55E00", label="the worst one lost")
+    beaten = [k for k, row in enumerate(rows) if not row["efficient"]]
+    if beaten:
+        axes.plot([count[k] for k in beaten], [rows[k]["value"] for k in beaten], "x", color="k", ms=9, label="beaten")
+    for row in rows:
+        axes.annotate(f"{row['cost']:.4g}", (row["transmitters"], row["value"]), (0, -14), fontsize=8,
+                      textcoords="offset points", ha="center")  # fmt: skip
+    axes.set_xlabel("transmitters (numbers below the points: cost)")
+    unit = f" [{summary['unit']} of the normal]" if summary["unit"] else ""
+    axes.set_ylabel(f"{summary['criterion']}, {summary['statistic']} over the field{unit}")
+    axes.set_xticks(count)
+    axes.set_ylim(0.0, None)
+    axes.margins(x=0.06)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    axes.set_title(f"{curve.scenario.name}: accuracy against number of transmitters")
+    _save(figure, path)

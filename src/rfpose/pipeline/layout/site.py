@@ -1,0 +1,188 @@
+"""What all layout studies begin with: the site, its field from CSV, and the postures of its mirrors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from rfpose.checks import FloatArray
+from rfpose.errors import GeometryError, ScenarioError
+from rfpose.feedback.sun import Site as SunSite
+from rfpose.feedback.sun import sun_position
+from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
+from rfpose.layout import maps
+from rfpose.layout.fields import read_positions
+from rfpose.layout.maps import Mirrors
+from rfpose.layout.sight import Plates, Tower
+from rfpose.multilat import check_unambiguous
+from rfpose.scenario import Scenario, load_scenario
+
+__all__ = ["Posture", "Postures", "Sight", "Sun", "load_site", "postures_of", "stacked"]
+
+Sun = tuple[float, float]
+
+_LOWEST_SUN_DEG = 5.0
+_DAY_STEP_MIN = 30
+_YEAR_STEP_MIN = 60
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Postures:
+    """Which postures are studied; without any of these each heliostat's own, or the simulated sun's, or level.
+
+    Attributes
+    ----------
+    suns_deg
+        Azimuth and elevation of suns whose light goes onto the aim point [deg].
+    day
+        Every half hour of this day with the sun above 5°.
+    year
+        Every hour, sun above 5°, of the 21st of each month.
+    stow
+        And face up.
+    """
+
+    suns_deg: Sequence[Sun] = ()
+    day: date | None = None
+    year: int | None = None
+    stow: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Posture:
+    """One posture of the whole field: what it is called, and its mirrors."""
+
+    name: str
+    mirrors: Mirrors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """What may stand in the way: plates of this size about each mirror's centre, and a tower at the origin [m]."""
+
+    plates: Plates
+    tower: Tower | None = None
+
+
+def load_site(path: str | Path, field_csv: str | Path | None, *, settings: dict[str, str] | None = None) -> Scenario:
+    """Return a scenario fit for layout studies, with the heliostats of a CSV file if one is given.
+
+    Parameters
+    ----------
+    path, field_csv
+        TOML; see `rfpose.layout.fields.read_positions`.
+    settings
+        Replace entries of ``[budget]``.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario or CSV is bad; transmitters too few, on a line or plane; heliostats on each other or on a
+        transmitter; the field wider than the longest tone resolves; the message begins with the file.
+    """
+    scenario = load_scenario(path)
+    if field_csv is not None:
+        scenario = _with_field(scenario, path, field_csv)
+    if settings:
+        data = scenario.model_dump(exclude_none=True)
+        data["budget"] = {**data.get("budget", {}), **settings}
+        scenario = Scenario.model_validate(data)
+    try:
+        check_unambiguous(maps.check_site(scenario.transmitter_enu_m), scenario.wavelength_m)
+        maps.check_clear(scenario)
+    except GeometryError as error:
+        raise ScenarioError(f"{path}: {error}") from error
+    return scenario
+
+
+def _with_field(scenario: Scenario, path: str | Path, field_csv: str | Path) -> Scenario:
+    if not scenario.heliostat:
+        raise ScenarioError(f"{path}: no heliostat whose mirror the field in {field_csv} could have; add one")
+    ids, pivot = read_positions(field_csv)
+    like = scenario.heliostat[0].model_dump(exclude_none=True)
+    like.pop("normal_enu", None)
+    n_receiver = len(scenario.heliostat[0].receiver_mirror_m)
+    data = scenario.model_dump(exclude_none=True)
+    data["heliostat"] = [
+        {**like, "id": name, "pivot_enu_m": tuple(place), "receiver_ids": [f"{name}_r{k}" for k in range(n_receiver)]}
+        for name, place in zip(ids, pivot.tolist(), strict=True)
+    ]
+    simulation = data.get("simulation", {})
+    simulation.pop("blocked", None)
+    simulation.pop("dropped", None)
+    return Scenario.model_validate(data)
+
+
+def postures_of(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Posture]:
+    """Return the postures to study.
+
+    Raises
+    ------
+    ScenarioError
+        A date without the site's latitude and longitude; a sun without an aim point; a day without sun.
+    """
+    try:
+        found = _suns(scenario, wanted, path)
+        if wanted.stow:
+            found.append(Posture(name="stow", mirrors=maps.mirrors_of(scenario, normal_enu=[0.0, 0.0, 1.0])))
+    except GeometryError as error:
+        raise ScenarioError(f"{path}: {error}") from error
+    return found
+
+
+def _suns(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Posture]:
+    suns = [(f"sun {az:g} {el:g}", (az, el)) for az, el in wanted.suns_deg]
+    if wanted.day is not None:
+        suns += _suns_of_day(scenario, wanted.day, _DAY_STEP_MIN, path)
+    if wanted.year is not None:
+        for month in range(1, 13):
+            suns += _suns_of_day(scenario, date(wanted.year, month, 21), _YEAR_STEP_MIN, path)
+    if (wanted.day is not None or wanted.year is not None) and not suns:
+        raise ScenarioError(f"{path}: the sun stays below {_LOWEST_SUN_DEG:g}° on that day; choose another")
+    if not suns and not wanted.stow:
+        azimuth, elevation = scenario.simulation.sun_azimuth_deg, scenario.simulation.sun_elevation_deg
+        own = all(h.normal_enu is not None for h in scenario.heliostat)
+        if own or azimuth is None or elevation is None or scenario.site.aim_enu_m is None:
+            return [Posture(name="own", mirrors=maps.mirrors_of(scenario))]
+        suns = [("simulated sun", (float(np.ravel(azimuth)[0]), float(np.ravel(elevation)[0])))]
+    return [Posture(name=name, mirrors=maps.mirrors_of(scenario, sun_enu=_direction(sun))) for name, sun in suns]
+
+
+def _direction(sun_deg: Sun) -> FloatArray:
+    return enu_from_azimuth_elevation(np.radians(sun_deg[0]), np.radians(sun_deg[1]))
+
+
+def _suns_of_day(scenario: Scenario, day: date, step_min: int, path: str | Path) -> list[tuple[str, Sun]]:
+    """Suns of one day, midnight to midnight by the site's own sun, above the lowest useful elevation."""
+    site = scenario.site
+    if site.latitude_deg is None or site.longitude_deg is None:
+        raise ScenarioError(f"{path}: a date needs [site] `latitude_deg` and `longitude_deg`; add them, or give --sun")
+    midnight = datetime(day.year, day.month, day.day, tzinfo=UTC) - timedelta(hours=site.longitude_deg / 15.0)
+    times = [midnight + timedelta(minutes=m) for m in range(0, 24 * 60, step_min)]
+    place = SunSite(
+        latitude_rad=np.radians(site.latitude_deg),
+        longitude_rad=np.radians(site.longitude_deg),
+        altitude_m=site.height_m,
+    )
+    azimuth, elevation = azimuth_elevation_from_enu(sun_position([t.timestamp() for t in times], place).direction_enu)
+    return [
+        (f"{time:%Y-%m-%d %H:%M}Z", (float(np.degrees(az)), float(np.degrees(el))))
+        for time, az, el in zip(times, azimuth, elevation, strict=True)
+        if el >= np.radians(_LOWEST_SUN_DEG)
+    ]
+
+
+def stacked(postures: Sequence[Mirrors]) -> Mirrors:
+    """Return one field of all postures, posture by posture."""
+    n = len(postures[0].pivot_enu_m)
+    places = [np.broadcast_to(m.receiver_mirror_m, (n, *m.receiver_mirror_m.shape[1:])) for m in postures]
+    alike = len(postures[0].receiver_mirror_m) == 1
+    return Mirrors(
+        pivot_enu_m=np.concatenate([m.pivot_enu_m for m in postures]),
+        rot_enu_from_mirror=np.concatenate([m.rot_enu_from_mirror for m in postures]),
+        receiver_mirror_m=postures[0].receiver_mirror_m if alike else np.concatenate(places),
+    )
