@@ -146,7 +146,7 @@ class Heliostats:
         step = np.sqrt(((sun_enu - self.sun_enu[index]) ** 2).sum(axis=1))
         ok = (step <= farthest) | ~(age <= fresh_s)
         if not ok.all():
-            index, sun_enu = index[ok], sun_enu[ok]
+            index, sun_enu = index[ok], np.broadcast_to(sun_enu, (len(ok), 3))[ok]
         self.sun_enu[index] = sun_enu
         self.sun_s[index] = said_s
 
