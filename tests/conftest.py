@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+FIGURE = "figure: "
+
 
 def _fdm_samples(
     n_sample: int,
@@ -49,3 +51,28 @@ def _fdm_samples(
 def fdm_samples() -> Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """A function that makes one frame of an FDM recording from the formula."""
     return _fdm_samples
+
+
+@pytest.fixture
+def figure(record_property: Callable[[str, object], None]) -> Callable[[str, float, str], None]:
+    """A function that states what a test measured; the run's summary lists it: ``figure(what, value, unit)``."""
+
+    def state(what: str, value: float, unit: str = "") -> None:
+        record_property(FIGURE + what, f"{value:.3g} {unit}".strip())
+
+    return state
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """List the figures that the tests stated."""
+    stated = [
+        (name.removeprefix(FIGURE), value)
+        for outcome in ("passed", "failed")
+        for report in terminalreporter.getreports(outcome)
+        for name, value in report.user_properties
+        if name.startswith(FIGURE)
+    ]
+    if stated:
+        terminalreporter.section("measured")
+        for what, value in sorted(stated):
+            terminalreporter.write_line(f"{what}: {value}")

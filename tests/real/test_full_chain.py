@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ def test_scenario_says_what_the_description_says() -> None:
 
 
 @pytest.mark.parametrize("estimator", ["hilbert", "correlator"])
-def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str) -> None:
+def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str, figure: Callable[..., None]) -> None:
     result = tmp_path / "result.h5"
     arguments = [str(SOURCE / "drf"), "--scenario", str(SITE), "-o", str(result), "--estimator", estimator]
     arguments += ["--pose", "independent", "--json"]
@@ -60,6 +61,8 @@ def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str) ->
     assert shown.exit_code == 0, shown.stderr
     found = json.loads(shown.stdout)
     # range noise 1.0 mm a transmitter at the bound, and as much from calibration: positions good to a few mm
+    figure(f"P6 three fits and cross product, {estimator}: normal", found["normal_error_mrad"]["rms"], "mrad")
+    figure(f"P6 three fits, {estimator}: worst receiver", 1e3 * found["position_error_m"]["max"], "mm")
     assert found["bound_m"]["rms"] == pytest.approx(2.2e-3, rel=0.1)
     assert found["position_error_m"]["max"] < 5e-3
     # three fits and a cross product, recomputed independently: 1.48 mrad on this recording, 1 to 3 over such ones;
@@ -79,7 +82,14 @@ def test_positions_and_normal_from_digital_rf(tmp_path: Path, estimator: str) ->
     ],
     ids=["three clocks", "one clock", "one clock and carrier", "three clocks and carrier"],
 )
-def test_rigid_normal_from_digital_rf(tmp_path: Path, mirror: str, expected_mrad: float, tolerance_mrad: float) -> None:
+def test_rigid_normal_from_digital_rf(
+    tmp_path: Path,
+    mirror: str,
+    expected_mrad: float,
+    tolerance_mrad: float,
+    figure: Callable[..., None],
+    request: pytest.FixtureRequest,
+) -> None:
     site = tmp_path / "site.toml"
     text = SITE.read_text()
     assert "[[heliostat]]\n" in text
@@ -87,5 +97,6 @@ def test_rigid_normal_from_digital_rf(tmp_path: Path, mirror: str, expected_mrad
     result = tmp_path / "result.h5"
     process(SOURCE / "drf", result, scenario_path=site, estimator="correlator", pose="rigid")
     found = evaluate(read_result(result), read_truth(SOURCE / "truth.json", read_result(result).scenario))
+    figure(f"P6 rigid, {request.node.callspec.id}: normal", found.normal_error_mrad.rms, "mrad")
     assert found.normal_error_mrad.rms == pytest.approx(expected_mrad, abs=tolerance_mrad)
     assert found.normal_error_mrad.rms < 4 * found.sigma_mrad

@@ -43,12 +43,13 @@ def bearing_rad(path: Path) -> float:
     return float(hilbert_phase_difference(am, fm, bandpass=(PASS_HZ[0] / rate_hz, PASS_HZ[1] / rate_hz)))
 
 
-def test_p4_bearings_after_one_common_offset():
+def test_p4_bearings_after_one_common_offset(figure):
     true_rad = np.radians([float(re.match(r"(\d+)deg", path.name)[1]) for path in RECORDINGS])
     error = np.exp(1j * (np.array([bearing_rad(path) for path in RECORDINGS]) - true_rad))
     residual_deg = np.degrees(np.angle(error / error.mean()))
     rms_deg = np.sqrt(np.mean(residual_deg**2))
     listing = ", ".join(f"{path.name} {r:+.2f}°" for path, r in zip(RECORDINGS, residual_deg, strict=True))
+    figure("P4 bearing to a VOR beacon: error, rms", rms_deg, "°")
     assert len(RECORDINGS) == 5
     assert rms_deg <= 0.8, listing
 
