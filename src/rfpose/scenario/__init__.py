@@ -9,6 +9,7 @@ from __future__ import annotations
 from rfpose.scenario._reading import load_scenario, parse_scenario
 from rfpose.scenario._scenario import Receiver, Scenario
 from rfpose.scenario.budget import Budget
+from rfpose.scenario.estimation import Integrity, Plane, Reflection
 from rfpose.scenario.records import (
     MAX_FRAME_SAMPLES,
     MIN_FRAME_SAMPLES,
@@ -33,9 +34,12 @@ __all__ = [
     "Dropout",
     "Ground",
     "Heliostat",
+    "Integrity",
     "Mirror",
+    "Plane",
     "Radio",
     "Receiver",
+    "Reflection",
     "Scenario",
     "Simulation",
     "Site",

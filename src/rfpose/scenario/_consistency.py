@@ -13,16 +13,29 @@ if TYPE_CHECKING:
 
 
 def _check_ids(s: Scenario) -> None:
-    for kind, ids in (
-        ("transmitter", s.transmitter_ids),
-        ("heliostat", s.heliostat_ids),
-        ("receiver", s.receiver_ids),
-    ):
+    for kind, ids in (("transmitter", s.transmitter_ids), ("heliostat", s.heliostat_ids)):
         seen: set[str] = set()
         for identifier in ids:
             if identifier in seen:
                 raise ValueError(f"{kind} `{identifier}` appears twice; identifiers must be unique")
             seen.add(identifier)
+    _check_receiver_ids(s)
+
+
+def _check_receiver_ids(s: Scenario) -> None:
+    owner: dict[str, str] = {}
+    for receiver in s.receivers:
+        mine = (
+            "calibration_receiver"
+            if receiver.heliostat is None
+            else f"heliostat `{s.heliostat_ids[receiver.heliostat]}`"
+        )
+        if receiver.id not in owner:
+            owner[receiver.id] = mine
+            continue
+        other = owner[receiver.id]
+        belongs = f"appears twice in {mine}" if mine == other else f"appears twice: it belongs to {other} and to {mine}"
+        raise ValueError(f"receiver `{receiver.id}` {belongs}; identifiers must be unique")
 
 
 def _check_transmitters_apart(s: Scenario) -> None:

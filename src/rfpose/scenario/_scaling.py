@@ -15,6 +15,7 @@ _LENGTH_KEYS = frozenset(
         "multipath_excess_m",
         "pivot_enu_m",
         "pivot_sigma_m",
+        "point_enu_m",
         "position_enu_m",
         "receiver_mirror_m",
         "receiver_mirror_sigma_m",

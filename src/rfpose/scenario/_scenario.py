@@ -15,6 +15,7 @@ from rfpose.errors import ScenarioError
 from rfpose.scenario._consistency import CHECKS
 from rfpose.scenario._scaling import scale_lengths
 from rfpose.scenario.budget import Budget
+from rfpose.scenario.estimation import Integrity, Reflection
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
 from rfpose.scenario.tracking import Tracking
@@ -43,6 +44,8 @@ class Scenario(Record):
     calibration_receiver: tuple[CalibrationReceiver, ...] = ()
     heliostat: tuple[Heliostat, ...] = ()
     simulation: Simulation = Simulation()
+    reflection: Reflection = Reflection()
+    integrity: Integrity = Integrity()
     budget: Budget = Budget()
     tracking: Tracking = Tracking()
 

@@ -95,6 +95,8 @@ class Mirror(Record):
     oscillator: Literal["shared", "separate"] = "shared"
     receiver_delay_sigma_s: NonNegative | None = None
     """How well the delays between a mirror's receivers are known; without it they are unknown in every frame."""
+    receiver_delay_drift_s_per_sqrt_min: NonNegative | None = None
+    """How fast unknown delays between receivers on one oscillator drift; given, they are learned over frames."""
     pivot_sigma_m: Positive | None = None
     """How well pivots are surveyed; without it they are not used."""
     carrier_phase: bool = True
@@ -113,6 +115,7 @@ class Heliostat(Record):
     arm_m: NonNegative = 0.0
     oscillator: Literal["shared", "separate"] = "shared"
     receiver_delay_sigma_s: NonNegative | None = None
+    receiver_delay_drift_s_per_sqrt_min: NonNegative | None = None
     pivot_sigma_m: Positive | None = None
     carrier_phase: bool = True
     mount: Literal["free", "azimuth_elevation"] = "free"
@@ -130,4 +133,15 @@ class Heliostat(Record):
             raise ValueError("`receiver_mirror_m` must not lie on a line: a line fixes no normal; move one aside")
         if self.normal_enu is not None and math.hypot(*self.normal_enu) < 1e-9:
             raise ValueError("`normal_enu` must not be zero")
+        if self.receiver_delay_drift_s_per_sqrt_min is not None:
+            if self.receiver_delay_sigma_s is not None:
+                raise ValueError(
+                    "give `receiver_delay_sigma_s` (delays known) or `receiver_delay_drift_s_per_sqrt_min` (delays "
+                    "learned over frames), not both"
+                )
+            if self.oscillator != "shared":
+                raise ValueError(
+                    "`receiver_delay_drift_s_per_sqrt_min` learns delays between receivers on one oscillator; it needs "
+                    '`oscillator = "shared"`'
+                )
         return self
