@@ -30,7 +30,7 @@ class MountErrors(Record):
     """Amplitude of the pedestal's daily lean."""
     creep_sigma_mrad_per_month: NonNegative = 0.05
     """Lean of the foundation, steady."""
-    fixed: dict[str, float] = {}
+    fixed: dict[str, float] = Field(default_factory=dict)
     """Parameters of the mount by name that all mirrors have alike [rad, m], instead of a draw."""
 
 
@@ -82,7 +82,7 @@ class RadioFeedback(Record):
     latency_s: NonNegative = 1.0
     lost_frames: Share = 0.1
     hidden_transmitters: Share = 0.0
-    """Part of the pairs of mirror and transmitter that are without line of sight, drawn anew every quarter of an hour."""
+    """Part of the pairs of mirror and transmitter that are without line of sight, drawn anew every 15 minutes."""
     outages: tuple[Outage, ...] = ()
     tone_snr_db: float | None = None
     """Instead of that of ``[simulation]``."""

@@ -1,0 +1,133 @@
+"""``rfpose track``: a field tracked in simulation, by radio and by what plants do today."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rfpose.cli._support import (
+    Session,
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    progress,
+    say,
+    table,
+    wants_json,
+)
+
+__all__ = ["command"]
+
+# names only, since the module that defines them loads numpy
+_METHODS = (
+    "open-loop", "encoder", "bias", "berenguel", "camera-model", "drone-model", "sun-sensor", "radio", "radio-model",
+    "radio-both",
+)  # fmt: skip
+
+
+@click.command(
+    name="track",
+    epilog=examples(
+        "rfpose track data/tracking_100m.toml -o day.h5",
+        "rfpose track site.toml -o year.h5 --heliostats 100 --days 12 --day-interval 30 --picture year.png",
+        "rfpose track site.toml -o field.h5 --heliostats 10000 --methods radio",
+    ),
+)
+@click.argument("scenario", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Result to write (HDF5).")
+@click.option(
+    "--methods", metavar="NAMES", help=f"Comma-separated; default: all that fit. Known: {', '.join(_METHODS)}."
+)
+@click.option("--days", type=click.IntRange(min=1), help="How many days; default: the scenario's.")
+@click.option("--day-interval", type=click.IntRange(min=1), help="Days from one simulated day to the next.")
+@click.option("--heliostats", type=int, help="How many mirrors; more than the scenario lists: spread over its field.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
+@click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
+@click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
+@force_option
+@common_options
+@click.pass_obj
+def command(
+    session: Session,
+    scenario: Path,
+    output: Path,
+    methods: str | None,
+    days: int | None,
+    day_interval: int | None,
+    heliostats: int | None,
+    seed: int,
+    csv_path: Path | None,
+    picture: Path | None,
+    force: bool,
+) -> None:
+    """Track a field in simulation, by each method on the same sun, wind and hidden errors; rank the methods.
+
+    SCENARIO is a TOML file; its [tracking] table says what mounts, drives, wind, radio and cameras are like.
+
+    Interrupted or killed, the same command goes on where it stopped; the result is the same. Milliradians are of the
+    mirror normal; the beam turns by twice as much.
+    """
+    from rfpose.pipeline.files import refuse_existing
+    from rfpose.pipeline.track import track
+    from rfpose.pipeline.track_file import write_track_csv
+
+    session.when_interrupted = "interrupted; the same command resumes where it stopped"
+    for path in (csv_path, picture):
+        if path is not None:
+            refuse_existing(path, force=force)
+    with progress("Tracking") as on_progress:
+        found = track(
+            scenario,
+            output,
+            methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
+            days=days,
+            day_interval=day_interval,
+            heliostats=heliostats,
+            seed=seed,
+            force=force,
+            on_progress=on_progress,
+        )
+    if csv_path is not None:
+        write_track_csv(found, csv_path)
+    if picture is not None:
+        from rfpose.pipeline.track_pictures import draw_track
+
+        draw_track(found, picture)
+    summary = found.as_dict()
+    if wants_json():
+        emit_json({"result": output, "csv": csv_path, "picture": picture, **summary})
+        return
+    n_day = len(summary["days"])
+    table(
+        f"{summary['scenario']}: {summary['heliostats']} mirrors, {n_day} day{'s' if n_day > 1 else ''}; "
+        "errors of the normal [mrad]",
+        ["method", "rms", "95 %", "worst", "mirror", "caught", "kWh/m²", "steps"],
+        [_row(name, summary["methods"][name]) for name in summary["ranking"]],
+    )
+    say("  rms, 95 % and worst of all mirrors and seconds; rms of the worst mirror; part of a perfect tracker's light")
+    say("  caught, light caught by a square metre of mirror; motor steps a mirror and day")
+    for name in summary["ranking"]:
+        outage = summary["methods"][name]["outage"]
+        if outage["rms_mrad"] is not None and name.startswith("radio"):
+            say(
+                f"  {name}: {outage['rms_mrad']:.3g} mrad while radio was out, "
+                f"{outage['loss_kwh_per_m2']:.3g} kWh/m² lost by it"
+            )
+        if summary["methods"][name]["out_of_reach"]:
+            share = 100.0 * summary["methods"][name]["out_of_reach"]
+            say(f"  {name}: {share:.2g} % of the time mirrors could not face their aim point")
+
+
+def _row(name: str, found: dict[str, Any]) -> list[str]:
+    normal = found["normal_mrad"]
+    cells = [normal["rms"], normal["p95"], normal["worst"], normal["worst_heliostat_rms"]]
+    return [
+        name,
+        *("–" if value is None else f"{value:.3g}" for value in cells),
+        "–" if found["intercept"] is None else f"{found['intercept']:.4f}",
+        f"{found['energy_kwh_per_m2']:.3f}",
+        f"{found['motor_steps_per_day']:.0f}",
+    ]

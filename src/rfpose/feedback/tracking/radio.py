@@ -1,0 +1,285 @@
+"""Radio poses as the loop gets them: the estimator's own covariance in each posture, and where it fails.
+
+Measurement level: no phases are drawn; noise has the covariance that `rfpose.multilat.rigid.rigid_bound` gives for the
+posture, the transmitters in sight and the clocks, pivots and carrier as the scenario has them. What estimating a ground
+reflection costs on top, or what ignoring it does, comes from `rfpose.multilat.ground.solve_with_ground` on phases of a
+sample of the mirrors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray
+from rfpose.errors import ScenarioError
+from rfpose.layout.maps import Noise, noise_of
+from rfpose.multilat.fix import check_transmitters
+from rfpose.multilat.ground import Reflector, solve_with_ground
+from rfpose.multilat.ground.model import range_shift_m
+from rfpose.multilat.rigid import Knowledge, rigid_bound
+from rfpose.multilat.rigid.integers import Observation
+from rfpose.scenario import Heliostat, Scenario
+
+__all__ = ["RadioErrors", "RadioModel"]
+
+_SAMPLE = 200
+"""Mirrors from which the effect of a reflection is taken over to all."""
+_SAFE_WAVELENGTHS = 1.0 / 12.0
+"""Six sigma within half a wavelength: from then on the carrier's whole wavelengths are found."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadioErrors:
+    """Errors of one frame's normals in given postures; right and up are those of the mirror.
+
+    Attributes
+    ----------
+    spread_rad : (mirror, 3)
+        Lower triangle of the noise: right; up with right, up [rad].
+    bias_rad : (mirror, 2)
+        What a reflection that is not modelled does, right and up [rad].
+    solved : (mirror,)
+        Whether there is a pose at all.
+    """
+
+    spread_rad: FloatArray
+    bias_rad: FloatArray
+    solved: npt.NDArray[np.bool_]
+
+    @property
+    def sigma_rad(self) -> FloatArray:
+        """(mirror,) rms angle of the noise [rad]."""
+        return np.asarray(np.sqrt(np.sum(self.spread_rad**2, axis=1)))
+
+
+class RadioModel:
+    """Errors of radio poses, posture by posture.
+
+    Parameters
+    ----------
+    scenario
+        Transmitters, tones, receivers, clocks; ``[tracking.radio]`` for what the loop does with them.
+    pivot_enu_m : (mirror, xyz)
+        Where the mirrors stand [m]. All carry the receivers of the scenario's first heliostat.
+
+    Raises
+    ------
+    ScenarioError
+        No heliostat that says where receivers are.
+    GeometryError
+        Transmitters that fix no position.
+    """
+
+    def __init__(self, scenario: Scenario, pivot_enu_m: FloatArray) -> None:
+        if not scenario.heliostat:
+            raise ScenarioError("no [[heliostat]] says where receivers are on a mirror; add one, or leave radio out")
+        check_transmitters(scenario.transmitter_enu_m)
+        self._scenario = scenario
+        self._pivot = np.array(pivot_enu_m)
+        self._kind: Heliostat = scenario.heliostat[0]
+        self._places = np.array(self._kind.receiver_mirror_m) + np.array([0.0, 0.0, self._kind.arm_m])
+        self._noise: Noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
+        ground = scenario.simulation.ground
+        self._handling = "none" if ground is None else scenario.tracking.radio.ground
+        self._excess: float | None = None
+        self._nearest = self._neighbours()
+
+    def errors(self, normal_enu: FloatArray, rng: np.random.Generator) -> RadioErrors:
+        """Return the errors of poses with these normals; ``rng`` draws which transmitters are hidden.
+
+        Parameters
+        ----------
+        normal_enu : (mirror, xyz)
+            Postures.
+        """
+        rot = geometry.rot_enu_from_mirror(normal_enu)
+        shape = (len(rot), 1, self._places.shape[0], len(self._scenario.transmitter))
+        share = self._scenario.tracking.radio.hidden_transmitters
+        hidden = np.zeros(shape, np.bool_)
+        if share > 0.0:
+            hidden[:] = (rng.random((shape[0], shape[3])) < share)[:, None, None, :]
+        turn = self._covariance(rot, hidden)
+        right, up = rot[:, :, 0], rot[:, :, 1]
+        # a turn θ moves the normal by θ × n: by θ·up to the right, by −θ·right upwards
+        rr = np.einsum("ma,mab,mb->m", up, turn, up)
+        uu = np.einsum("ma,mab,mb->m", right, turn, right)
+        ru = -np.einsum("ma,mab,mb->m", up, turn, right)
+        solved = np.isfinite(rr) & (rr > 0.0)
+        first = np.sqrt(np.where(solved, rr, 1.0))
+        cross = np.where(solved, ru, 0.0) / first
+        spread = np.stack([first, cross, np.sqrt(np.maximum(np.where(solved, uu, 1.0) - cross**2, 0.0))], axis=1)
+        bias = np.zeros((len(rot), 2))
+        if self._handling == "estimated":
+            spread *= self._estimation_excess(rot)
+        elif self._handling == "ignored":
+            bias = self._bias_if_ignored(rot)
+        spread[~solved] = 0.0
+        return RadioErrors(spread_rad=spread, bias_rad=bias, solved=solved)
+
+    def _covariance(self, rot: FloatArray, hidden: npt.NDArray[np.bool_]) -> FloatArray:
+        """(mirror, 3, 3) of the rotation; the carrier takes part where the tones find its whole wavelengths."""
+        pivot = self._pivot
+        sigma = np.broadcast_to(self._sigma_m(rot), (len(rot), *self._sigma_shape()))
+        sigma = np.where(hidden, np.inf, sigma)
+        n_tone = len(self._scenario.tone)
+        known = self._knowledge(pivot)
+        common = self._common_m()
+        classes = np.arange(sigma.shape[1])
+        bound = rigid_bound(
+            self._scenario.transmitter_enu_m, self._places, pivot, rot, sigma_m=sigma[:, :n_tone],
+            transmitter_sigma_m=common[:n_tone], clock_class=classes[:n_tone], knowledge=known,
+        )  # fmt: skip
+        turn = bound[:, 3:, 3:]
+        if sigma.shape[1] == n_tone:
+            return turn
+        wavelength = self._carrier_wavelength_m()
+        extent = float(np.linalg.norm(self._places - self._places[0], axis=1).max())
+        finds = extent * np.sqrt(np.trace(turn, axis1=1, axis2=2)) < _SAFE_WAVELENGTHS * float(wavelength.min())
+        finer = rigid_bound(
+            self._scenario.transmitter_enu_m, self._places, pivot, rot, sigma_m=sigma,
+            transmitter_sigma_m=common, clock_class=classes, knowledge=known,
+        )[:, 3:, 3:]  # fmt: skip
+        return np.where(finds[:, None, None], finer, turn)
+
+    # -- what goes into a pose -----------------------------------------------------------------------------
+
+    def _uses_carrier(self) -> bool:
+        shared = self._kind.oscillator == "shared" and self._kind.carrier_phase
+        return shared and self._noise.carrier_sigma_m is not None
+
+    def _carrier_wavelength_m(self) -> FloatArray:
+        radio = self._scenario.radio
+        return np.asarray(radio.propagation_speed_mps / (radio.centre_frequency_hz + self._scenario.carrier_hz))
+
+    def _sigma_shape(self) -> tuple[int, int, int]:
+        n_group = len(self._scenario.tone) + int(self._uses_carrier())
+        return n_group, self._places.shape[0], len(self._scenario.transmitter)
+
+    def _sigma_m(self, rot: FloatArray) -> FloatArray:
+        """(mirror or 1, group, receiver, transmitter) own noise of ranges [m]."""
+        noise = self._noise
+        rows = list(noise.tone_sigma_m)
+        if self._uses_carrier() and noise.carrier_sigma_m is not None:
+            rows.append(noise.carrier_sigma_m)
+        sigma = np.stack(rows)[None, :, None, :]
+        if noise.reference_range_m is not None:
+            receiver = self._pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)
+            distance = np.linalg.norm(receiver[:, :, None] - self._scenario.transmitter_enu_m, axis=-1)
+            sigma = sigma * (distance / noise.reference_range_m)[:, None]
+        return np.asarray(sigma)
+
+    def _common_m(self) -> FloatArray:
+        """(group, transmitter) errors common to all receivers [m]."""
+        calibrated = bool(self._scenario.calibration_receiver)
+        tones = self._noise.calibration_sigma_m if calibrated else np.full_like(self._noise.tone_sigma_m, np.inf)
+        if not self._uses_carrier():
+            return np.asarray(tones)
+        return np.concatenate([tones, np.full((1, tones.shape[1]), np.inf)])
+
+    def _knowledge(self, pivot: FloatArray) -> Knowledge:
+        kind = self._kind
+        delay = kind.receiver_delay_sigma_s
+        shared = kind.oscillator == "shared" and delay is not None
+        return Knowledge(
+            clock_sigma_m=float(delay or 0.0) * self._scenario.radio.propagation_speed_mps if shared else np.inf,
+            pivot_enu_m=pivot if kind.pivot_sigma_m is not None else None,
+            pivot_sigma_m=np.inf if kind.pivot_sigma_m is None else kind.pivot_sigma_m,
+            two_axis=kind.mount == "azimuth_elevation",
+        )
+
+    # -- reflections ---------------------------------------------------------------------------------------
+
+    def _neighbours(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Which mirrors stand for the field, and which of them stands for each mirror."""
+        from scipy.spatial import KDTree
+
+        sample = np.unique(np.linspace(0, len(self._pivot) - 1, min(_SAMPLE, len(self._pivot))).astype(np.int64))
+        nearest = KDTree(self._pivot[sample]).query(self._pivot)[1]
+        return sample, np.asarray(nearest, np.int64)
+
+    def _observations(self, pivot: FloatArray, rot: FloatArray) -> list[Observation]:
+        """Ranges of mirrors over the reflecting ground, without noise."""
+        scenario, ground = self._scenario, self._scenario.simulation.ground
+        assert ground is not None
+        mirror = Reflector(point_enu_m=(0.0, 0.0, ground.height_m), coefficient=complex(*ground.coefficient))
+        tone_hz = np.append(scenario.tone_hz, 0.0) if self._uses_carrier() else scenario.tone_hz
+        receiver = (pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)).reshape(-1, 3)
+        distance = np.linalg.norm(receiver[:, None] - scenario.transmitter_enu_m, axis=-1)
+        common = self._common_m()
+
+        def shift(points: FloatArray) -> FloatArray:
+            return range_shift_m(
+                scenario.transmitter_enu_m,
+                points,
+                reflectors=[mirror],
+                carrier_rf_hz=scenario.radio.centre_frequency_hz + scenario.carrier_hz,
+                tone_hz=tone_hz,
+                propagation_speed_mps=scenario.radio.propagation_speed_mps,
+            )
+
+        z = distance[..., None] + shift(receiver)
+        if scenario.calibration_receiver:
+            z = z - shift(scenario.calibration_enu_m).mean(axis=0) * np.isfinite(common.T)
+        z = z.reshape(len(pivot), len(self._places), len(scenario.transmitter), -1)
+        sigma = np.broadcast_to(self._sigma_m(rot), (len(self._pivot), *self._sigma_shape()))
+        sigma = sigma[: len(pivot)]
+        waves = [np.full(len(scenario.transmitter), w) for w in scenario.wavelength_m] + [self._carrier_wavelength_m()]
+        order = [*np.argsort(-scenario.wavelength_m), *([len(scenario.tone)] if self._uses_carrier() else [])]
+        return [
+            Observation(
+                range_m=np.ascontiguousarray(z[..., q]),
+                sigma_m=np.ascontiguousarray(sigma[:, q]),
+                transmitter_sigma_m=np.broadcast_to(common[q], (len(pivot), common.shape[1])).copy(),
+                wavelength_m=waves[q],
+                clock_class=int(q == len(scenario.tone)),
+            )
+            for q in order
+        ]
+
+    def _solve(self, rot: FloatArray, *, estimate: bool) -> tuple[FloatArray, FloatArray]:
+        """Normals and rotation covariances of the sampled mirrors by the solver itself."""
+        sample = self._nearest[0]
+        pivot, rot = self._pivot[sample], rot[sample]
+        ground = self._scenario.simulation.ground
+        assert ground is not None
+        found = solve_with_ground(
+            self._scenario.transmitter_enu_m,
+            self._places,
+            self._observations(pivot, rot),
+            carrier_rf_hz=self._scenario.radio.centre_frequency_hz + self._scenario.carrier_hz,
+            start_pivot_enu_m=pivot,
+            start_rot_enu_from_mirror=rot,
+            reflectors=(Reflector(point_enu_m=(0.0, 0.0, ground.height_m)),) if estimate else (),
+            calibration_enu_m=self._scenario.calibration_enu_m if self._scenario.calibration_receiver else None,
+            knowledge=self._knowledge(pivot),
+            propagation_speed_mps=self._scenario.radio.propagation_speed_mps,
+            min_probability=0.0,
+        )
+        return found.poses.normal_enu, found.poses.cov[:, 3:, 3:]
+
+    def _estimation_excess(self, rot: FloatArray) -> float:
+        """How much larger the noise is for estimating the reflection too; found once."""
+        if self._excess is None:
+            _, turn = self._solve(rot, estimate=True)
+            alone = RadioModel._covariance(self, rot, np.zeros((len(rot), 1, 1, 1), np.bool_))[self._nearest[0]]
+            both = np.isfinite(turn[:, 0, 0]) & np.isfinite(alone[:, 0, 0])
+            if not both.any():
+                raise ScenarioError(
+                    "the ground reflection cannot be estimated with these poses: give pivots (`pivot_sigma_m`), a "
+                    'longer frame or a finer tone, or set [tracking.radio] ground = "ignored" to see what that does'
+                )
+            ratio = np.trace(turn[both], axis1=1, axis2=2) / np.trace(alone[both], axis1=1, axis2=2)
+            self._excess = float(np.sqrt(np.median(ratio)))
+        return self._excess
+
+    def _bias_if_ignored(self, rot: FloatArray) -> FloatArray:
+        """(mirror, 2) what the reflection does to normals that are solved without it [rad]."""
+        sample, nearest = self._nearest
+        normal, _ = self._solve(rot, estimate=False)
+        off = normal - rot[sample][:, :, 2]
+        bias = np.stack([np.sum(off * rot[sample][:, :, i], axis=1) for i in (0, 1)], axis=1)
+        return np.asarray(np.nan_to_num(bias)[nearest])

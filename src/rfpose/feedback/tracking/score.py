@@ -1,0 +1,173 @@
+"""How well a method did: errors, light caught, motors spared, what lost radio cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, read_only
+from rfpose.feedback.tracking import _kernels as kernels
+from rfpose.feedback.tracking.simulation import Sums
+
+__all__ = ["Score", "score"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Score:
+    """One method over all days; angles in rad, NaN where nothing was scored.
+
+    Attributes
+    ----------
+    normal_rms_rad, normal_p95_rad, normal_worst_rad
+        Error of the normal over all mirrors and steps.
+    beam_rms_rad, beam_worst_rad
+        Error of the beam; of a dish: of its axis.
+    intercept
+        Light caught over light that a perfect tracker would catch.
+    energy_j_per_m2
+        Light caught by a square metre of mirror, from a clear sky.
+    motor_steps, motor_starts
+        By mirror and day, both axes together.
+    heliostat_rms_rad, heliostat_p95_rad, heliostat_worst_rad, heliostat_intercept : (mirror,)
+    hour_rms_rad : (24,)
+        By hour of local mean solar time.
+    day_rms_rad, day_worst_heliostat_rad : (day,)
+        Over the field; the worst mirror's rms.
+    day_intercept : (day,)
+    outage_rms_rad, outage_intercept
+        While radio was out.
+    outage_loss_j_per_m2
+        Light spilt meanwhile, by mirror, beyond what is spilt at other times.
+    lost_frames
+        Part of the radio frames that brought nothing.
+    out_of_reach
+        Part of the steps in which a mirror could not face its aim.
+    """
+
+    normal_rms_rad: float
+    normal_p95_rad: float
+    normal_worst_rad: float
+    beam_rms_rad: float
+    beam_worst_rad: float
+    intercept: float
+    energy_j_per_m2: float
+    motor_steps: float
+    motor_starts: float
+    heliostat_rms_rad: FloatArray
+    heliostat_p95_rad: FloatArray
+    heliostat_worst_rad: FloatArray
+    heliostat_intercept: FloatArray
+    hour_rms_rad: FloatArray
+    day_rms_rad: FloatArray
+    day_worst_heliostat_rad: FloatArray
+    day_intercept: FloatArray
+    outage_rms_rad: float
+    outage_intercept: float
+    outage_loss_j_per_m2: float
+    lost_frames: float
+    out_of_reach: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values with stable keys; milliradians say of what."""
+        return {
+            "normal_mrad": {
+                "rms": 1e3 * self.normal_rms_rad,
+                "p95": 1e3 * self.normal_p95_rad,
+                "worst": 1e3 * self.normal_worst_rad,
+                "worst_heliostat_rms": 1e3 * _largest(self.heliostat_rms_rad),
+            },
+            "beam_mrad": {"rms": 1e3 * self.beam_rms_rad, "worst": 1e3 * self.beam_worst_rad},
+            "intercept": self.intercept,
+            "spillage": 1.0 - self.intercept,
+            "energy_kwh_per_m2": self.energy_j_per_m2 / 3.6e6,
+            "motor_steps_per_day": self.motor_steps,
+            "motor_starts_per_day": self.motor_starts,
+            "day_rms_mrad": 1e3 * self.day_rms_rad,
+            "day_intercept": self.day_intercept,
+            "hour_rms_mrad": 1e3 * self.hour_rms_rad,
+            "outage": {
+                "rms_mrad": 1e3 * self.outage_rms_rad,
+                "intercept": self.outage_intercept,
+                "loss_kwh_per_m2": self.outage_loss_j_per_m2 / 3.6e6,
+            },
+            "lost_frames": self.lost_frames,
+            "out_of_reach": self.out_of_reach,
+        }
+
+
+def score(sums: Sums) -> Score:
+    """Return a method's score."""
+    total = sums.total
+    n_day, n_mirror = total.shape[:2]
+    by_mirror = total.sum(axis=0)
+    everything = by_mirror.sum(axis=0)
+    worst = total.max(axis=0)
+    day = total.sum(axis=1)
+    hours = sums.hours.sum(axis=0)
+    intercept = _ratio(everything[kernels.CAUGHT], everything[kernels.ENERGY])
+    dark = _ratio(everything[kernels.OUTAGE_CAUGHT], everything[kernels.OUTAGE_ENERGY])
+    lit = _ratio(
+        everything[kernels.CAUGHT] - everything[kernels.OUTAGE_CAUGHT],
+        everything[kernels.ENERGY] - everything[kernels.OUTAGE_ENERGY],
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rms = np.sqrt(by_mirror[:, kernels.SQUARE] / by_mirror[:, kernels.STEPS])
+        by_day = np.sqrt(total[..., kernels.SQUARE] / total[..., kernels.STEPS])
+        hour_rms = np.sqrt(hours[:, 1] / hours[:, 0])
+        day_rms = np.sqrt(day[:, kernels.SQUARE] / day[:, kernels.STEPS])
+        caught = by_mirror[:, kernels.CAUGHT] / by_mirror[:, kernels.ENERGY]
+        day_caught = day[:, kernels.CAUGHT] / day[:, kernels.ENERGY]
+    scored = by_mirror[:, kernels.STEPS] > 0.0
+    return Score(
+        normal_rms_rad=float(np.sqrt(_ratio(everything[kernels.SQUARE], everything[kernels.STEPS]))),
+        normal_p95_rad=float(quantile(sums.histogram.sum(axis=0)[None], 0.95)[0]),
+        normal_worst_rad=float(worst[:, kernels.WORST].max()) if scored.any() else np.nan,
+        beam_rms_rad=float(np.sqrt(_ratio(everything[kernels.BEAM_SQUARE], everything[kernels.STEPS]))),
+        beam_worst_rad=float(worst[:, kernels.BEAM_WORST].max()) if scored.any() else np.nan,
+        intercept=intercept,
+        energy_j_per_m2=float(everything[kernels.CAUGHT]) / n_mirror,
+        motor_steps=float(everything[kernels.MOTOR_1] + everything[kernels.MOTOR_2]) / (n_mirror * n_day),
+        motor_starts=float(everything[kernels.STARTS]) / (n_mirror * n_day),
+        heliostat_rms_rad=read_only(rms),
+        heliostat_p95_rad=read_only(quantile(sums.histogram, 0.95)),
+        heliostat_worst_rad=read_only(np.where(scored, worst[:, kernels.WORST], np.nan)),
+        heliostat_intercept=read_only(caught),
+        hour_rms_rad=read_only(hour_rms),
+        day_rms_rad=read_only(day_rms),
+        day_worst_heliostat_rad=read_only(np.array([_largest(row) for row in by_day])),
+        day_intercept=read_only(day_caught),
+        outage_rms_rad=float(np.sqrt(_ratio(everything[kernels.OUTAGE_SQUARE], everything[kernels.OUTAGE_STEPS]))),
+        outage_intercept=dark,
+        outage_loss_j_per_m2=float(max(lit - dark, 0.0) * everything[kernels.OUTAGE_ENERGY] / n_mirror)
+        if np.isfinite(dark)
+        else 0.0,
+        lost_frames=_ratio(everything[kernels.FRAMES_LOST], everything[kernels.FRAMES]),
+        out_of_reach=_ratio(
+            everything[kernels.OUT_OF_REACH], everything[kernels.OUT_OF_REACH] + everything[kernels.STEPS]
+        ),
+    )
+
+
+def quantile(histogram: npt.NDArray[np.int64], part: float) -> FloatArray:
+    """Return a quantile of each row's normal errors (row,) [rad], linear in the logarithm within a bin."""
+    cumulated = np.cumsum(histogram, axis=1)
+    wanted = part * cumulated[:, -1:]
+    slot = np.minimum(np.sum(cumulated < wanted, axis=1), histogram.shape[1] - 1)
+    row = np.arange(len(histogram))
+    below = cumulated[row, slot] - histogram[row, slot]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inside = (wanted[:, 0] - below) / histogram[row, slot]
+        value = kernels.LOWEST_RAD * 10.0 ** ((slot + inside) / kernels.BINS_PER_DECADE)
+    return np.asarray(np.where(cumulated[:, -1] > 0, value, np.nan))
+
+
+def _ratio(part: float, whole: float) -> float:
+    return float(part) / float(whole) if whole > 0.0 else float("nan")
+
+
+def _largest(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.max()) if finite.size else float("nan")

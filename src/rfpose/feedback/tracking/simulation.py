@@ -1,0 +1,428 @@
+"""The run: all methods through the same days, on the same sun, wind, hidden errors and lost frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, read_only
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback.mount import PARAMETERS
+from rfpose.feedback.tracking import _kernels
+from rfpose.feedback.tracking.hidden import Field, draw_field, generator
+from rfpose.feedback.tracking.instruments import LEARNED, Workshop
+from rfpose.feedback.tracking.loops import Margins, check_gains
+from rfpose.feedback.tracking.methods import Method, choose
+from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.timeline import Day, days
+from rfpose.feedback.tracking.wind import Gusts
+from rfpose.scenario import Scenario
+
+__all__ = ["Curves", "Simulation", "Sums"]
+
+Arrays = dict[str, npt.NDArray[np.generic]]
+
+SEGMENT_S = 900.0
+"""Simulated time between two points at which a run can be taken up again."""
+_FORGET_OFFSET_S = 300.0
+_FIRST_SIGMA_RAD = 0.3e-3
+_SUN_RAD = 9.3e-3
+_FREE = np.array([list(PARAMETERS).index(name) for name in LEARNED])
+_SCALE = np.array([PARAMETERS[name] for name in LEARNED])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sums:
+    """What one method's mirrors added up to.
+
+    Attributes
+    ----------
+    total : (day, mirror, sum)
+        Sums by the kernels' names.
+    hours : (mirror, 24, 2)
+        Steps and squared normal errors by hour of local mean solar time.
+    histogram : (mirror, bin)
+        Of normal errors, `BINS_PER_DECADE` a decade from `LOWEST_RAD`.
+    """
+
+    total: FloatArray
+    hours: FloatArray
+    histogram: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Courses of one method; time axis is `Simulation.stored_unix_s`.
+
+    Attributes
+    ----------
+    rms_rad, p95_rad, worst_rad : (time,)
+        Normal error over the field at that instant; NaN while nothing has been simulated.
+    normal_enu : (time, stored, xyz)
+        True normals of the stored mirrors.
+    error_rad : (time, stored)
+        Their errors.
+    motor_count : (time, stored, axis)
+        Motor positions.
+    offset_rad : (time, stored, axis)
+        What feedback has turned the axes further than the model.
+    """
+
+    rms_rad: FloatArray
+    p95_rad: FloatArray
+    worst_rad: FloatArray
+    normal_enu: FloatArray
+    error_rad: FloatArray
+    motor_count: FloatArray
+    offset_rad: FloatArray
+
+
+@dataclass(slots=True, kw_only=True)
+class _Run:
+    """One method under way."""
+
+    method: Method
+    loop: _kernels.Loop
+    model: FloatArray
+    cov: FloatArray
+    state: FloatArray
+    ring: FloatArray
+    total: FloatArray
+    hours: FloatArray
+    histogram: npt.NDArray[np.int64]
+    curve: FloatArray
+    trace: FloatArray
+    stored_error: FloatArray
+
+    def arrays(self) -> Arrays:
+        """Return all that changes, by name."""
+        return {name: getattr(self, name) for name in _RUN_ARRAYS}
+
+
+_RUN_ARRAYS = ("model", "cov", "state", "ring", "total", "hours", "histogram", "curve", "trace", "stored_error")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Segment:
+    """A stretch of one day."""
+
+    i_day: int
+    first: int
+    end: int
+    first_stored: int = field(default=0)
+
+
+class Simulation:
+    """A field tracked by several methods; go through it with `advance`.
+
+    Parameters
+    ----------
+    scenario
+        Site, mirrors, radio, and ``[tracking]``.
+    methods
+        Names of `METHODS`; none: all that can steer the collector.
+    count
+        Number of mirrors; None: those of the scenario.
+    seed
+        Everything random follows from it; what one method meets does not depend on which others run.
+
+    Raises
+    ------
+    ScenarioError, GeometryError, InvalidInputError
+        The scenario cannot be tracked: no mirrors, no site, no sun, an aim point that no mirror reaches, transmitters
+        that fix nothing, gains without margin.
+    """
+
+    def __init__(
+        self, scenario: Scenario, *, methods: Sequence[str] = (), count: int | None = None, seed: int = 0
+    ) -> None:
+        if isinstance(seed, bool) or seed < 0:
+            raise InvalidInputError(f"`seed` must be a non-negative integer, got {seed!r}")
+        plan = scenario.tracking
+        self.scenario, self.seed = scenario, int(seed)
+        self.methods = choose(methods, collector=plan.collector)
+        self.days: tuple[Day, ...] = days(scenario)
+        noon = self.days[0].sun_enu[int(np.argmax(self.days[0].sun_enu[:, 2]))]
+        self.field: Field = draw_field(scenario, count=count, seed=self.seed, noon_enu=noon)
+        self.gusts = Gusts(scenario)
+        needs_radio = any(m.radio for m in self.methods)
+        self.margins: Margins | None = check_gains(scenario) if needs_radio else None
+        self.radio = RadioModel(scenario, self.field.pivot_enu_m) if needs_radio else None
+        self._workshop = Workshop(scenario, self.field, self.radio, self.gusts, seed=self.seed)
+        self._stride = round(plan.store_interval_s / plan.servo_interval_s)
+        self.segments = self._segments()
+        n = len(self.field)
+        self.stored = np.unique(np.linspace(0, n - 1, min(plan.stored, n)).astype(np.int64))
+        self._runs = [self._start(m) for m in self.methods]
+        self._gust_state = np.zeros((n, 3))
+        self.done = 0
+        self._check_reach()
+
+    # -- plan ----------------------------------------------------------------------------------------------
+
+    @property
+    def n_segment(self) -> int:
+        """Number of stretches to advance through."""
+        return len(self.segments)
+
+    @property
+    def stored_unix_s(self) -> FloatArray:
+        """(time,) instants of the curves, all days in turn [s since 1970 UTC]."""
+        return np.concatenate([day.unix_s[:: self._stride] for day in self.days])
+
+    @property
+    def stored_sun_enu(self) -> FloatArray:
+        """(time, xyz) sun at the curves' instants."""
+        return np.concatenate([day.sun_enu[: len(day.unix_s) : self._stride] for day in self.days])
+
+    @property
+    def stored_day(self) -> npt.NDArray[np.int64]:
+        """(time,) which day each instant belongs to."""
+        return np.concatenate([np.full(len(d.unix_s[:: self._stride]), i) for i, d in enumerate(self.days)])
+
+    def _segments(self) -> tuple[_Segment, ...]:
+        length = max(1, round(SEGMENT_S / self.scenario.tracking.store_interval_s)) * self._stride
+        found, stored = [], 0
+        for i, day in enumerate(self.days):
+            n_step = len(day.unix_s)
+            for first in range(0, n_step, length):
+                found.append(
+                    _Segment(
+                        i_day=i,
+                        first=first,
+                        end=min(first + length, n_step),
+                        first_stored=stored + first // self._stride,
+                    )
+                )
+            stored += -(-n_step // self._stride)
+        return tuple(found)
+
+    def _check_reach(self) -> None:
+        """Refuse a field of which no mirror reaches its aim at noon."""
+        from rfpose.feedback import _kernels as mount_kernels
+        from rfpose.feedback.mount import aim_rows
+
+        day = self.days[0]
+        noon = day.sun_enu[int(np.argmax(day.sun_enu[:, 2]))]
+        dish = bool(self.field.target[0, 3])
+        goal = np.broadcast_to(noon, (len(self.field), 1, 3)) if dish else self.field.target[:, None, :3]
+        rows = aim_rows(
+            np.broadcast_to(noon, (len(self.field), 1, 3)), goal, source_is_point=False, target_is_point=not dish
+        )
+        _, status = mount_kernels.command_batch(self.field.nominal, self.field.constant, np.ascontiguousarray(rows))
+        if np.all(status != 0):
+            raise ScenarioError(
+                f"no mirror reaches its aim point on {day.date} at noon: {self.field.ids[0]} is "
+                f"{'beyond its limits' if status[0, 0] == 2 else 'without a posture'}; check `aim_enu_m` and "
+                "[tracking.drive] limits"
+            )
+
+    def _loop(self, method: Method) -> _kernels.Loop:
+        plan = self.scenario.tracking
+        radio, servo = plan.radio, plan.servo_interval_s
+        control = round(plan.control_interval_s / servo)
+        per_rad = plan.drive.steps_per_turn / (2.0 * np.pi)
+        step = float(plan.drive.microsteps)
+        interval, latency, gain, integral, level = control, 1, 0.0, 0.0, 1.0  # what is seen in a step acts in the next
+        if method.feedback == _kernels.RADIO:
+            gain, integral = radio.gain_per_s, radio.integral_gain_per_s2
+            latency = max(int(np.ceil(radio.latency_s / servo - 1e-9)), 1)
+            if latency > (_kernels.N_RING - 1) * interval:
+                raise InvalidInputError(
+                    f"[tracking.radio] `latency_s` {radio.latency_s:g} is more than {_kernels.N_RING - 1} control "
+                    "intervals; shorten it or lengthen `control_interval_s`"
+                )
+        elif method.feedback == _kernels.ENCODER:
+            interval, gain, level = 1, plan.encoder.gain_per_s, 2.0 * np.pi / 2**plan.encoder.bits
+        elif method.feedback == _kernels.SUN_SENSOR:
+            sensor = plan.sun_sensor
+            interval, gain, integral = 1, sensor.gain_per_s, sensor.integral_gain_per_s2
+            level = 2e-3 * sensor.range_mrad / sensor.levels
+        seconds = interval * servo
+        learn = max(1, round(plan.radio_model.learn_interval_s / plan.control_interval_s)) if method.learns else 0
+        return _kernels.Loop(
+            feedback=method.feedback,
+            interval=interval,
+            latency=latency,
+            gain=gain,
+            integral=integral,
+            step=step,
+            dead_band=max(plan.drive.dead_band_steps * 1.0, 0.5 * step),
+            speed=max(np.floor(1e-3 * plan.drive.speed_mradps * servo * per_rad / step), 1.0) * step,
+            leak=float(np.exp(-seconds / _FORGET_OFFSET_S)) if method.learns else 1.0,
+            learn=learn,
+            wind_variance=self.gusts.variance_rad2,
+            settle=round(plan.settle_s / servo),
+            servo_s=servo,
+            level=level,
+            reach=1e-3 * plan.sun_sensor.range_mrad,
+            disc=0.5 * _SUN_RAD + 1e-3 * plan.slope_error_mrad,
+        )
+
+    def _start(self, method: Method) -> _Run:
+        n, n_time = len(self.field), len(self.stored_unix_s)
+        n_free = len(_FREE)
+        cov = np.zeros((n, n_free, n_free)) if method.learns else np.zeros((1, n_free, n_free))
+        if method.learns:
+            cov[:, np.arange(n_free), np.arange(n_free)] = _FIRST_SIGMA_RAD**2
+        return _Run(
+            method=method,
+            loop=self._loop(method),
+            model=self.field.nominal.copy(),
+            cov=cov,
+            state=np.zeros((n, _kernels.N_STATE)),
+            ring=np.zeros((n, _kernels.N_RING, _kernels.N_ENTRY)),
+            total=np.zeros((len(self.days), n, _kernels.N_SUM)),
+            hours=np.zeros((n, 24, 2)),
+            histogram=np.zeros((n, _kernels.N_BIN), np.int64),
+            curve=np.full((n_time, 3), np.nan),
+            trace=np.full((max(len(self.stored), 1), n_time, 7), np.nan),
+            stored_error=np.full((n_time, len(self.stored)), np.nan),
+        )
+
+    # -- go on ---------------------------------------------------------------------------------------------
+
+    def advance(self) -> None:
+        """Simulate the next stretch of time."""
+        segment = self.segments[self.done]
+        day = self.days[segment.i_day]
+        plan, n = self.scenario.tracking, len(self.field)
+        if segment.first == 0:
+            self._gust_state[:] = self.gusts.begin(generator(self.seed, 1, segment.i_day), n)
+            for run in self._runs:
+                self._begin_day(run, segment.i_day)
+        place = (segment.i_day, segment.first)
+        n_step = segment.end - segment.first
+        control = round(plan.control_interval_s / plan.servo_interval_s)
+        n_frame = -(-n_step // control)
+        gust = self.gusts.run(self._gust_state, generator(self.seed, 2, *place), n_step)
+        rng = generator(self.seed, 3, *place)
+        noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
+        lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
+        outage = self._outage(day.hour[segment.first : segment.end])
+        spread, bias = np.zeros((n, 3)), np.zeros((n, 2))
+        if self.radio is not None:
+            errors = self.radio.errors(self._wanted_normal(day, (segment.first + segment.end) // 2), rng)
+            spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
+            lost[~errors.solved] = 1
+        true = self.field.at(day.since_first)
+        stored = np.full(n, -1, np.int64)
+        stored[self.stored] = np.arange(len(self.stored))
+        n_stored = -(-n_step // self._stride)
+        steps = slice(segment.first, segment.end)
+        for run in self._runs:
+            error = np.full((n, n_stored), np.nan)
+            trace = np.full((max(len(self.stored), 1), n_stored, 7), np.nan)
+            loop = run.loop
+            is_sensor = run.method.feedback == _kernels.SUN_SENSOR
+            drift = self._sensor_drift() if is_sensor else self.field.plate_drift_rad
+            _kernels.advance(
+                loop, segment.first, true, self.field.constant, self.field.lean_rad, day.heat[steps].copy(), run.model,
+                np.broadcast_to(run.cov, (n, *run.cov.shape[1:])).copy() if not run.method.learns else run.cov,
+                _FREE, _SCALE, self._walk(), day.sun_enu[segment.first : segment.end + loop.interval + 1].copy(),
+                self.field.target, gust, self.gusts.mean_mps, self.gusts.bend, noise, spread, bias, lost, outage,
+                day.power_w_per_m2[steps].copy(), 1e-3 * np.array(plan.drive.backlash_mrad) * self._per_rad(),
+                1e-3 * np.array(plan.drive.stiction_mrad) * self._per_rad(), drift, self.field.sensor_bias_rad,
+                run.state, run.ring, run.total[segment.i_day], run.hours, day.hour[steps].astype(np.int64),
+                run.histogram, self._stride, error, stored, trace,
+            )  # fmt: skip
+            at = slice(segment.first_stored, segment.first_stored + n_stored)
+            run.curve[at] = _over_field(error)
+            run.trace[:, at] = trace
+            run.stored_error[at] = error[self.stored].T
+        self.done += 1
+
+    def _begin_day(self, run: _Run, i_day: int) -> None:
+        day = self.days[i_day]
+        run.state[:] = 0.0
+        run.ring[:] = 0.0
+        if run.method.learns and i_day > 0:
+            passed = day.since_first - self.days[i_day - 1].since_first
+            sigma = 1e-3 * self.scenario.tracking.radio_model.forget_mrad_per_sqrt_day
+            run.cov[:, np.arange(len(_FREE)), np.arange(len(_FREE))] += sigma**2 * passed
+            return
+        run.model[:] = self._workshop.model(run.method, day)
+
+    def _per_rad(self) -> float:
+        return self.scenario.tracking.drive.steps_per_turn / (2.0 * np.pi)
+
+    def _walk(self) -> FloatArray:
+        """Variance that the rolling fit adds to each parameter at a step."""
+        plan = self.scenario.tracking.radio_model
+        return np.full(len(_FREE), (1e-3 * plan.forget_mrad_per_sqrt_day) ** 2 * plan.learn_interval_s / 86_400.0)
+
+    def _sensor_drift(self) -> FloatArray:
+        rng = generator(self.seed, 7)
+        return np.asarray(0.5e-3 * self.scenario.tracking.sun_sensor.drift_mrad * rng.standard_normal(len(self.field)))
+
+    def _wanted_normal(self, day: Day, i_step: int) -> FloatArray:
+        sun = day.sun_enu[i_step]
+        if self.field.target[0, 3]:
+            return np.broadcast_to(sun, (len(self.field), 3)).copy()
+        return geometry.bisector_enu(self.field.target[:, :3] - self.field.pivot_enu_m, sun)
+
+    def _outage(self, hour: FloatArray) -> npt.NDArray[np.uint8]:
+        """(mirror, step) one where the radio is lost."""
+        n = len(self.field)
+        out = np.zeros((n, len(hour)), np.uint8)
+        for i, outage in enumerate(self.scenario.tracking.radio.outages):
+            dark = (hour >= outage.first_hour) & (hour < outage.last_hour)
+            hit = generator(self.seed, 8, i).random(n) < outage.share
+            out |= (hit[:, None] & dark[None]).astype(np.uint8)
+        return out
+
+    # -- results -------------------------------------------------------------------------------------------
+
+    def sums(self, name: str) -> Sums:
+        """Return what a method's mirrors have added up to so far."""
+        run = self._run(name)
+        return Sums(total=read_only(run.total), hours=read_only(run.hours), histogram=read_only(run.histogram))
+
+    def curves(self, name: str) -> Curves:
+        """Return a method's courses so far."""
+        run = self._run(name)
+        trace = np.swapaxes(run.trace[: len(self.stored)], 0, 1)
+        return Curves(
+            rms_rad=read_only(run.curve[:, 0]),
+            p95_rad=read_only(run.curve[:, 1]),
+            worst_rad=read_only(run.curve[:, 2]),
+            normal_enu=read_only(trace[..., :3]),
+            error_rad=read_only(run.stored_error),
+            motor_count=read_only(trace[..., 3:5]),
+            offset_rad=read_only(trace[..., 5:7]),
+        )
+
+    def _run(self, name: str) -> _Run:
+        return next(run for run in self._runs if run.method.name == name)
+
+    # -- interruption --------------------------------------------------------------------------------------
+
+    def state(self) -> Arrays:
+        """Return all that going on depends on."""
+        found: Arrays = {"done": np.array(self.done), "gust": self._gust_state}
+        for run in self._runs:
+            found |= {f"{run.method.name}/{name}": values for name, values in run.arrays().items()}
+        return found
+
+    def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
+        """Go back to what `state` gave, of a run with the same arguments."""
+        self.done = int(state["done"])
+        self._gust_state[:] = state["gust"]
+        for run in self._runs:
+            for name, values in run.arrays().items():
+                values[...] = state[f"{run.method.name}/{name}"]
+
+
+def _over_field(error: FloatArray) -> FloatArray:
+    """(time, 3) rms, 95 % and worst over the mirrors that have an error."""
+    out = np.full((error.shape[1], 3), np.nan)
+    seen = np.isfinite(error).any(axis=0)
+    some = error[:, seen]
+    out[seen, 0] = np.sqrt(np.nanmean(some**2, axis=0))
+    out[seen, 1] = np.nanpercentile(some, 95.0, axis=0)
+    out[seen, 2] = np.nanmax(some, axis=0)
+    return out

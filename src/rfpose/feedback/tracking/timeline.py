@@ -1,0 +1,137 @@
+"""When a field tracks: the days, their steps, where the sun stands, what its light is worth."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray, read_only
+from rfpose.errors import ScenarioError
+from rfpose.feedback.sun import Site, sun_position
+from rfpose.scenario import Scenario
+
+__all__ = ["Day", "beam_w_per_m2", "day_of", "days", "hour_of_day", "site_of"]
+
+_COARSE_S = 20.0
+_MARGIN_S = 120.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Day:
+    """One day's tracking.
+
+    Attributes
+    ----------
+    date
+        Local.
+    since_first
+        Days since the first day of the run.
+    unix_s : (step,)
+        Beginnings of the servo steps [s since 1970 UTC].
+    sun_enu : (step + lead, xyz)
+        Towards the sun; goes on beyond the last step, for commands ahead of time.
+    power_w_per_m2 : (step,)
+        Beam of the sun under a clear sky [W/m²].
+    hour : (step,)
+        Local mean solar time [h].
+    """
+
+    date: datetime.date
+    since_first: int
+    unix_s: FloatArray
+    sun_enu: FloatArray
+    power_w_per_m2: FloatArray
+    hour: FloatArray
+
+    @property
+    def heat(self) -> FloatArray:
+        """(step,) how warm it is: −1 … 1 over the day, greatest at three in the afternoon."""
+        return np.asarray(np.cos(2.0 * np.pi * (self.hour - 15.0) / 24.0))
+
+
+def site_of(scenario: Scenario) -> Site:
+    """Return where the field is.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario does not say.
+    """
+    place = scenario.site
+    if place.latitude_deg is None or place.longitude_deg is None:
+        raise ScenarioError("[site] `latitude_deg` and `longitude_deg` are missing: they place the sun; add them")
+    return Site(
+        latitude_rad=float(np.deg2rad(place.latitude_deg)),
+        longitude_rad=float(np.deg2rad(place.longitude_deg)),
+        altitude_m=place.height_m,
+    )
+
+
+def beam_w_per_m2(elevation_rad: npt.ArrayLike) -> FloatArray:
+    """Return the clear-sky beam [W/m²]; zero below the horizon.
+
+    References
+    ----------
+    .. [1] Edwards, Arrays of paraboloidal collectors, (3.8), (3.9).
+    """
+    sine = np.sin(np.asarray(elevation_rad, np.float64))
+    air = np.sqrt((755.6 * sine) ** 2 + 2.0 * 755.6 + 1.0) - 755.6 * sine
+    return np.asarray(np.where(sine > 0.0, np.maximum(1353.0 * (1.0 - 0.232 * air**0.427), 0.0), 0.0))
+
+
+def hour_of_day(unix_s: npt.ArrayLike, site: Site) -> FloatArray:
+    """Return local mean solar time [h]."""
+    return np.asarray(np.mod(np.asarray(unix_s) / 3600.0 + np.rad2deg(site.longitude_rad) / 15.0, 24.0))
+
+
+def days(scenario: Scenario) -> tuple[Day, ...]:
+    """Return the days of a run, each from the sun's rise above the least elevation until it falls below.
+
+    Raises
+    ------
+    ScenarioError
+        No site; a day on which the sun does not rise far enough.
+    """
+    plan = scenario.tracking
+    return tuple(
+        day_of(scenario, plan.date + datetime.timedelta(days=i * plan.day_interval), i * plan.day_interval)
+        for i in range(plan.days)
+    )
+
+
+def day_of(scenario: Scenario, date: datetime.date, since_first: int) -> Day:
+    """Return one day; see `days`."""
+    plan, site = scenario.tracking, site_of(scenario)
+    midnight = datetime.datetime(date.year, date.month, date.day, tzinfo=datetime.UTC).timestamp()
+    midnight -= np.rad2deg(site.longitude_rad) / 15.0 * 3600.0
+    coarse = midnight + np.arange(plan.first_hour * 3600.0, plan.last_hour * 3600.0, _COARSE_S)
+    up = sun_position(coarse, site).elevation_rad > np.deg2rad(plan.min_sun_elevation_deg)
+    if not up.any():
+        raise ScenarioError(
+            f"[tracking] on {date} the sun is never above {plan.min_sun_elevation_deg:g} degrees between hours "
+            f"{plan.first_hour:g} and {plan.last_hour:g} at latitude {np.rad2deg(site.latitude_rad):.2f}; choose another "
+            "`date`, hours, or a lower `min_sun_elevation_deg`"
+        )
+    begin, end = np.ceil(coarse[up][0]), coarse[up][-1]
+    lead = max(round(plan.control_interval_s / plan.servo_interval_s), 1) + 1
+    # whole frames, so that every stretch of the day begins with one
+    n_step = max(int((end - begin) / plan.control_interval_s), 1) * (lead - 1)
+    times = begin + plan.servo_interval_s * np.arange(n_step + lead)
+    # the sun's path is smooth: exact every minute, a cubic through the points between
+    from scipy.interpolate import CubicSpline
+
+    knots = np.arange(begin - _MARGIN_S, times[-1] + _MARGIN_S, 60.0)
+    direction = CubicSpline(knots, sun_position(knots, site).direction_enu)(times)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    elevation = np.arcsin(np.clip(direction[:n_step, 2], -1.0, 1.0))
+    return Day(
+        date=date,
+        since_first=since_first,
+        unix_s=read_only(times[:n_step]),
+        sun_enu=read_only(direction),
+        power_w_per_m2=read_only(beam_w_per_m2(elevation)),
+        hour=read_only(hour_of_day(times[:n_step], site)),
+    )

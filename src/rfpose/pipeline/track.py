@@ -1,0 +1,98 @@
+"""A scenario in, a tracking run out: resumable, the same bytes for the same seed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rfpose import __version__
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.feedback.tracking import Simulation
+from rfpose.pipeline._checkpoint import Checkpoint
+from rfpose.pipeline.files import refuse_existing
+from rfpose.pipeline.track_file import Track, track_of, write_track
+from rfpose.scenario import Scenario, load_scenario
+
+__all__ = ["track"]
+
+
+def track(
+    scenario_path: str | Path,
+    result_path: str | Path,
+    *,
+    methods: Sequence[str] = (),
+    days: int | None = None,
+    day_interval: int | None = None,
+    heliostats: int | None = None,
+    seed: int = 0,
+    force: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> Track:
+    """Track a scenario's field by several methods and write what came of it.
+
+    Parameters
+    ----------
+    scenario_path
+        TOML.
+    result_path
+        File to write, format ``rfpose-tracking``. While the run lasts its state is kept beside it; a killed run goes on
+        from there and gives the same bytes.
+    methods
+        Names; none: all that can steer the collector.
+    days, day_interval
+        Instead of those in ``[tracking]``.
+    heliostats
+        How many mirrors; see `rfpose.feedback.tracking.hidden.field_positions`.
+    seed
+        Same scenario and seed, same result.
+    force
+        Overwrite an existing file, and discard unfinished work.
+    on_progress
+        Called with (stretches of time done, stretches in all).
+
+    Raises
+    ------
+    ScenarioError
+        The scenario is malformed or cannot be tracked; the message begins with the file.
+    RecordingError
+        The file exists already or cannot be written; unfinished work of another job is in the way.
+    """
+    result_path = Path(result_path)
+    refuse_existing(result_path, force=force)
+    scenario = _with(load_scenario(scenario_path), days=days, day_interval=day_interval)
+    try:
+        simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
+    except (ScenarioError, GeometryError, InvalidInputError) as error:
+        raise ScenarioError(f"{scenario_path}: {error}") from error
+    settings = {
+        "version": __version__,
+        "seed": str(seed),
+        "methods": " ".join(m.name for m in simulation.methods),
+        "heliostats": str(len(simulation.field)),
+    }
+    key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
+    checkpoint = Checkpoint(result_path.with_name(f".{result_path.name}.state"), key, restart=force)
+    state = checkpoint.read()
+    if state is not None:
+        simulation.restore(state)
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+        if on_progress is not None:
+            on_progress(simulation.done, simulation.n_segment)
+        checkpoint.write(simulation.state())
+    found = track_of(simulation, settings)
+    write_track(found, result_path)
+    checkpoint.remove()
+    return found
+
+
+def _with(scenario: Scenario, **changed: Any) -> Scenario:
+    """Return the scenario with some keys of ``[tracking]`` changed; None leaves one as it is."""
+    values = {name: value for name, value in changed.items() if value is not None}
+    if not values:
+        return scenario
+    data = scenario.model_dump(exclude_none=True)
+    data["tracking"] = {**data["tracking"], **values}
+    return Scenario.model_validate(data)
