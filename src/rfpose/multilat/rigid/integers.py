@@ -1,27 +1,70 @@
 """From wrapped phases to poses: coarse tone first, each finer wavelength once its integers are safe.
 
-The pose found so far predicts the next finer range with a known uncertainty. Its integers are rounded where that makes
-a wrong one rarer than the stated risk; otherwise the mirror keeps the coarser solution and says so.
+The pose found so far predicts the next finer range with a known uncertainty. Its integers are rounded one by one where
+that makes a wrong one rarer than the stated risk. Where it does not, all of a mirror's integers are found together by
+least squares, with what the rigid mirror makes common to them; where the turn is too uncertain for a straight-line
+model, the pose itself decides between the likeliest. Otherwise the mirror keeps the coarser solution and says so.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import erfc
+from scipy.stats import chi2 as chi2_distribution
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, solve_rigid
+from rfpose.multilat.rigid.search import (
+    DELAY_REACH_M,
+    Candidates,
+    Prediction,
+    can_search,
+    predict,
+    search_integers,
+)
 
-__all__ = ["Observation", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
+__all__ = ["IntegerMethod", "Observation", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
 
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
-_DELAY_REACH_M = 3.0
-"""Unknown delays between a mirror's receivers are searched up to this, 10 ns."""
+_SAFE_ROUNDING = 1e-6
+"""Where rounding errs less often than this there is nothing to search."""
+
+_UNLIKELY = 1e-6
+"""Residuals rarer than this are worth another start."""
+
+_SEARCH_ROWS = 4096
+"""Mirrors searched at a time: their covariances are kept."""
+
+_COMPLETE = 40.0
+"""Candidates are all that matter when the next one fits worse than the best by this much of squared norm."""
+
+
+class IntegerMethod(IntEnum):
+    """How an observation's integers were found."""
+
+    FLOAT = 0
+    GIVEN = 1
+    ROUNDED = 2
+    LEAST_SQUARES = 3
+    CONSTRAINED = 4
+
+    @property
+    def reason(self) -> str:
+        """The method in words."""
+        return (
+            "not found safely: the observation is left out",
+            "resolved beforehand",
+            "rounded one by one",
+            "least squares over all of the mirror's integers",
+            "least squares, then the pose itself decided between the likeliest",
+        )[self]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,12 +103,25 @@ class RigidSolution:
     fixed : (mirror, observation)
         Whether an observation's integers were resolved and used.
     wrong_risk : (mirror, observation)
-        Probability, beforehand, that any of its integers is wrong; 1 where it could not be judged.
+        Probability, beforehand, that any of its integers is wrong, by the best method; 1 where it could not be judged.
+    method : (mirror, observation)
+        `IntegerMethod`; FLOAT where not fixed.
+    odds_against : (mirror, observation)
+        Where integers were searched: what the data leave to the runners-up, afterwards; else NaN.
+    adop_cycles : (mirror, observation)
+        Where integers were searched: their ambiguity dilution of precision; else NaN.
+    range_m : one (mirror, receiver, transmitter) an observation
+        Resolved ranges, NaN where left out [m]. Whole wavelengths that a clock or a transmitter's own error takes up
+        are as they happen to be.
     """
 
     poses: RigidPoses
     fixed: BoolArray
     wrong_risk: FloatArray
+    method: IntArray
+    odds_against: FloatArray
+    adop_cycles: FloatArray
+    range_m: tuple[FloatArray, ...]
 
 
 def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -108,6 +164,7 @@ def solve_ladder(
     start_rot_enu_from_mirror: npt.ArrayLike,
     knowledge: Knowledge | None = None,
     wrong_risk: float = 1e-6,
+    search: bool = True,
 ) -> RigidSolution:
     """Solve poses from the coarsest wavelength down.
 
@@ -125,11 +182,24 @@ def solve_ladder(
         Clocks, pivot, mount.
     wrong_risk
         Largest probability that any integer of an observation is wrong, for it to be used.
+    search
+        Where rounding is not safe, find a mirror's integers together, by least squares [1]_ [2]_.
 
     Raises
     ------
     InvalidInputError
         No observation, or shapes that do not fit.
+
+    Notes
+    -----
+    The stated risk is that of the method used: the sum over all integers (rounding), or that of sequential rounding
+    after decorrelation, an upper bound of least squares. It is a statement about the noise, made before the data.
+
+    References
+    ----------
+    .. [1] Teunissen, The least-squares ambiguity decorrelation adjustment, J. Geodesy 70 (1995) 65–82.
+    .. [2] Teunissen, Integer least-squares theory for the GNSS compass, J. Geodesy 84 (2010) 433–447: the receivers'
+       known places constrain the search.
     """
     if not observations:
         raise InvalidInputError("`observations` must hold at least one wavelength")
@@ -137,49 +207,179 @@ def solve_ladder(
         raise InvalidInputError(f"`wrong_risk` must lie between 0 and 1, got {wrong_risk}")
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
     places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
-    n_mirror = len(places)
-    fixed = np.zeros((n_mirror, len(observations)), np.bool_)
-    risk = np.ones((n_mirror, len(observations)))
-    resolved = [np.full(o.range_m.shape, np.nan) for o in observations]
-    poses: RigidPoses | None = None
-    for k, observation in enumerate(observations):
-        if poses is None:
-            resolved[k] = observation.range_m
-            fixed[:, k], risk[:, k] = True, 0.0
-        else:
-            ranges, risk[:, k] = _resolve(
-                observation,
-                transmitter,
-                places,
-                poses,
-                knowledge or Knowledge(),
-            )
-            safe: BoolArray = np.less_equal(risk[:, k], wrong_risk)
-            fixed[:, k] = safe
-            resolved[k] = np.where(safe[:, None, None], ranges, np.nan)
-        used = observations[: k + 1]
-        solution = solve_rigid(
-            transmitter,
-            places,
-            np.stack(resolved[: k + 1], axis=1),
-            sigma_m=np.stack([o.sigma_m for o in used], axis=1),
-            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in used], axis=1),
+    ladder = _Ladder(transmitter, places, observations, knowledge or Knowledge(), wrong_risk)
+    poses = ladder.solve(
+        np.arange(len(places)),
+        [np.array(observations[0].range_m)[:, None]],
+        start_pivot_enu_m,
+        start_rot_enu_from_mirror,
+    )
+    for k in range(1, len(observations)):
+        poses = ladder.climb(k, poses, start_pivot_enu_m, start_rot_enu_from_mirror, search=search)
+    return RigidSolution(
+        poses=poses,
+        fixed=ladder.method != IntegerMethod.FLOAT,
+        wrong_risk=ladder.risk,
+        method=ladder.method,
+        odds_against=ladder.odds,
+        adop_cycles=ladder.adop,
+        range_m=tuple(ladder.resolved),
+    )
+
+
+class _Ladder:
+    """The state of a climb: which integers are resolved so far, how, and at what risk."""
+
+    def __init__(
+        self,
+        transmitter: FloatArray,
+        places: FloatArray,
+        observations: list[Observation],
+        known: Knowledge,
+        wrong_risk: float,
+    ) -> None:
+        shape = (len(places), len(observations))
+        self.transmitter, self.places, self.known, self.limit = transmitter, places, known, wrong_risk
+        self.observations = observations
+        self.resolved = [np.full(o.range_m.shape, np.nan) for o in observations]
+        self.resolved[0] = np.array(observations[0].range_m)
+        self.method = np.full(shape, IntegerMethod.FLOAT, np.int64)
+        self.method[:, 0] = IntegerMethod.GIVEN
+        self.risk = np.ones(shape)
+        self.risk[:, 0] = 0.0
+        self.odds, self.adop = np.full(shape, np.nan), np.full(shape, np.nan)
+
+    def solve(
+        self,
+        mirrors: IntArray,
+        ranges: list[FloatArray],
+        start_pivot_enu_m: npt.ArrayLike,
+        start_rot_enu_from_mirror: npt.ArrayLike,
+    ) -> RigidPoses:
+        """Solve some mirrors with the first observations; each of ``ranges`` is (mirror, candidate, …).
+
+        Rows of the result are mirror × candidate, of the start too, where it has as many.
+        """
+        used = self.observations[: len(ranges)]
+        repeat = max(r.shape[1] for r in ranges)
+        rows = np.repeat(mirrors, repeat)
+        pivot = self.known.pivot_enu_m
+        shape = (len(mirrors), repeat, *ranges[0].shape[2:])
+        return solve_rigid(
+            self.transmitter,
+            self.places[rows],
+            np.stack([np.broadcast_to(r, shape).reshape(-1, *shape[2:]) for r in ranges], axis=1),
+            sigma_m=np.stack([o.sigma_m[rows] for o in used], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m[rows] for o in used], axis=1),
             clock_class=[o.clock_class for o in used],
-            start_pivot_enu_m=start_pivot_enu_m if poses is None else _or(poses.pivot_enu_m, start_pivot_enu_m),
-            start_rot_enu_from_mirror=start_rot_enu_from_mirror
-            if poses is None
-            else _or(poses.rot_enu_from_mirror, start_rot_enu_from_mirror),
-            knowledge=knowledge,
+            start_pivot_enu_m=start_pivot_enu_m,
+            start_rot_enu_from_mirror=start_rot_enu_from_mirror,
+            knowledge=self.known if pivot is None else replace(self.known, pivot_enu_m=_rows_of(pivot, rows)),
         )
-        if poses is not None:
-            # what made a solved mirror unsolvable is not used for it
-            worse = (poses.status == RigidStatus.OK) & (solution.status != RigidStatus.OK)
-            fixed[worse, k] = False
-            resolved[k][worse] = np.nan
-            solution = _merge(solution, poses, worse)
-        poses = solution
-    assert poses is not None
-    return RigidSolution(poses=poses, fixed=fixed, wrong_risk=risk)
+
+    def climb(
+        self,
+        k: int,
+        poses: RigidPoses,
+        start_pivot_enu_m: npt.ArrayLike,
+        start_rot_enu_from_mirror: npt.ArrayLike,
+        *,
+        search: bool,
+    ) -> RigidPoses:
+        """Resolve observation k where that is safe, and solve with it."""
+        observation = self.observations[k]
+        prediction = predict(self.transmitter, self.places, poses)
+        ranges, self.risk[:, k] = _round(observation, prediction, self.known)
+        rounding_risk = self.risk[:, k].copy()
+        limit = min(self.limit, _SAFE_ROUNDING) if search else self.limit
+        self._take_rounded(k, ranges, np.less_equal(rounding_risk, limit))
+        unsafe = np.flatnonzero((self.method[:, k] == IntegerMethod.FLOAT) & (poses.status == RigidStatus.OK))
+        calibrated = bool(np.isfinite(observation.transmitter_sigma_m).all())
+        if search and len(unsafe) and can_search(calibrated, observation.wavelength_m):
+            self._search(k, unsafe, poses, prediction)
+        left: BoolArray = np.equal(self.method[:, k], IntegerMethod.FLOAT) & (rounding_risk <= self.limit)
+        self._take_rounded(k, ranges, left)
+        everyone = np.arange(len(self.places))
+        solution = self.solve(
+            everyone,
+            [r[:, None] for r in self.resolved[: k + 1]],
+            _or(poses.pivot_enu_m, start_pivot_enu_m),
+            _or(poses.rot_enu_from_mirror, start_rot_enu_from_mirror),
+        )
+        # a coarse wavelength may have led into another minimum, which the finer one cannot leave but shows
+        lost = np.flatnonzero(_is_unlikely(solution))
+        if len(lost):
+            again = self.solve(
+                lost,
+                [r[lost][:, None] for r in self.resolved[: k + 1]],
+                np.broadcast_to(np.asarray(start_pivot_enu_m, np.float64), solution.pivot_enu_m.shape)[lost],
+                np.broadcast_to(np.asarray(start_rot_enu_from_mirror), solution.rot_enu_from_mirror.shape)[lost],
+            )
+            with np.errstate(invalid="ignore"):
+                keep = ~(again.chi2 < np.where(np.isfinite(solution.chi2[lost]), solution.chi2[lost], np.inf))
+            solution = _placed(solution, lost[~keep], _taken(again, np.flatnonzero(~keep)))
+        # what made a solved mirror unsolvable is not used for it
+        worse = (poses.status == RigidStatus.OK) & (solution.status != RigidStatus.OK)
+        self.method[worse, k] = IntegerMethod.FLOAT
+        self.resolved[k][worse] = np.nan
+        return _merge(solution, poses, worse)
+
+    def _take_rounded(self, k: int, ranges: FloatArray, which: BoolArray) -> None:
+        self.method[which, k] = IntegerMethod.ROUNDED
+        self.resolved[k][which] = ranges[which]
+
+    def _search(self, k: int, mirrors: IntArray, poses: RigidPoses, prediction: Prediction) -> None:
+        """Resolve by least squares what could not be rounded."""
+        observation = self.observations[k]
+        for part in np.array_split(mirrors, -(-len(mirrors) // _SEARCH_ROWS)):
+            found = search_integers(
+                observation.range_m[part],
+                np.broadcast_to(observation.sigma_m, observation.range_m.shape)[part],
+                observation.transmitter_sigma_m[part],
+                observation.wavelength_m,
+                Prediction(
+                    distance_m=prediction.distance_m[part],
+                    slope=prediction.slope[part],
+                    cov=prediction.cov[part],
+                    bend_m=prediction.bend_m[part],
+                ),
+                self.known,
+            )
+            risk, odds = found.wrong_risk.copy(), found.odds_against.copy()
+            chosen = np.zeros(len(part), np.int64)
+            method = np.full(len(part), IntegerMethod.LEAST_SQUARES, np.int64)
+            bent = (risk > self.limit) & (found.straight_risk <= self.limit)
+            if bent.any():
+                chosen[bent], odds[bent], complete = self._decide(k, part[bent], found, bent, poses)
+                method[bent] = IntegerMethod.CONSTRAINED
+                risk[bent] = np.where(complete, found.straight_risk[bent], 1.0)
+            better = risk < self.risk[part, k]
+            self.risk[part, k] = np.where(better, risk, self.risk[part, k])
+            self.odds[part, k], self.adop[part, k] = odds, found.adop_cycles
+            safe = risk <= self.limit
+            self.method[part[safe], k] = method[safe]
+            self.resolved[k][part[safe]] = found.range_m[safe, chosen[safe]]
+
+    def _decide(
+        self, k: int, mirrors: IntArray, found: Candidates, chosen: BoolArray, poses: RigidPoses
+    ) -> tuple[IntArray, FloatArray, BoolArray]:
+        """Solve the pose with each candidate: the likeliest, the odds of the others, whether the list was complete."""
+        norm = found.squared_norm[chosen]
+        n = norm.shape[1]
+        trial = self.solve(
+            mirrors,
+            [r[mirrors][:, None] for r in self.resolved[:k]] + [found.range_m[chosen]],
+            np.repeat(poses.pivot_enu_m[mirrors], n, axis=0),
+            np.repeat(poses.rot_enu_from_mirror[mirrors], n, axis=0),
+        )
+        chi2 = np.where(trial.status == RigidStatus.OK, trial.chi2, np.inf).reshape(norm.shape)
+        chi2 = np.where(np.isfinite(norm), chi2, np.inf)
+        best = np.argmin(chi2, axis=1)
+        lowest = chi2.min(axis=1, keepdims=True)
+        with np.errstate(invalid="ignore"):
+            odds = np.nan_to_num(np.exp(-0.5 * (chi2 - lowest))).sum(axis=1) - 1.0
+            complete = np.isfinite(lowest[:, 0]) & (norm[:, -1] - norm[:, 0] > _COMPLETE)
+        return best, odds, complete
 
 
 def _merge(new: RigidPoses, old: RigidPoses, keep_old: BoolArray) -> RigidPoses:
@@ -195,25 +395,40 @@ def _merge(new: RigidPoses, old: RigidPoses, keep_old: BoolArray) -> RigidPoses:
     return RigidPoses(**arrays)
 
 
+def _taken(poses: RigidPoses, rows: IntArray) -> RigidPoses:
+    """Return some rows of poses."""
+    return RigidPoses(**{name: getattr(poses, name)[rows] for name in RigidPoses.__dataclass_fields__})
+
+
+def _placed(poses: RigidPoses, rows: IntArray, other: RigidPoses) -> RigidPoses:
+    """Return poses with some rows replaced."""
+    arrays = {name: np.array(getattr(poses, name)) for name in RigidPoses.__dataclass_fields__}
+    for name, array in arrays.items():
+        array[rows] = getattr(other, name)
+    return RigidPoses(**arrays)
+
+
+def _is_unlikely(poses: RigidPoses) -> BoolArray:
+    """Not solved, or with residuals that noise hardly makes."""
+    with np.errstate(invalid="ignore"):
+        rare = chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)) < _UNLIKELY
+    return np.asarray(rare | (poses.status == RigidStatus.NOT_CONVERGED))
+
+
 def _or(first: FloatArray, second: npt.ArrayLike) -> FloatArray:
     return np.where(np.isfinite(first), first, np.asarray(second, np.float64))
 
 
-def _resolve(
-    observation: Observation,
-    transmitter: FloatArray,
-    places: FloatArray,
-    poses: RigidPoses,
-    known: Knowledge,
-) -> tuple[FloatArray, FloatArray]:
+def _rows_of(pivot: FloatArray, rows: IntArray) -> FloatArray:
+    """Rows of surveyed pivots, one for all or one a mirror."""
+    return pivot if pivot.ndim == 1 or len(pivot) == 1 else pivot[rows]
+
+
+def _round(observation: Observation, prediction: Prediction, known: Knowledge) -> tuple[FloatArray, FloatArray]:
     """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
-    arm = np.einsum("mab,mrb->mra", poses.rot_enu_from_mirror, places)
-    to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - transmitter
-    distance = np.linalg.norm(to_receiver, axis=-1)
-    direction = to_receiver / distance[..., None]
-    slope = np.concatenate([direction, np.cross(arm[:, :, None], direction)], axis=-1)
+    slope = prediction.slope
     wavelength = observation.wavelength_m
-    left = observation.range_m - distance
+    left = observation.range_m - prediction.distance_m
     calibrated = np.isfinite(observation.transmitter_sigma_m).all()
     # what clocks add is found from the ranges themselves: the mean over transmitters says nothing about integers
     centred = slope - slope.mean(axis=2, keepdims=True)
@@ -228,8 +443,10 @@ def _resolve(
         offset_free = not np.isfinite(known.clock_sigma_m)
         slope = centred - centred[:, :1] if offset_free else slope - slope[:, :1]
         noise = noise if offset_free else noise + 2.0 * known.clock_sigma_m**2
-    predicted = np.einsum("mria,mab,mrib->mri", slope, poses.cov, slope)
-    sigma = np.sqrt(predicted + noise)
+    predicted = np.einsum("mria,mab,mrib->mri", slope, prediction.cov, slope)
+    # the straight-line model's own error counts, of both receivers where two are compared
+    bend = prediction.bend_m**2 if calibrated else prediction.bend_m**2 + prediction.bend_m[:, :1] ** 2
+    sigma = np.sqrt(predicted + noise + bend[:, :, None])
     offset_risk = np.zeros(left.shape[:2])
     if offset_free:
         offset, offset_risk = common_offset(left, wavelength, sigma)
@@ -249,7 +466,7 @@ def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -
     """Return the common offset of ranges known up to whole wavelengths, per receiver, and the risk of a wrong one.
 
     With one wavelength the offset is near zero; any multiple of it does as well. With unequal wavelengths (carriers)
-    it is the one within ±`_DELAY_REACH_M` that fits best, and the runner-up tells how safely.
+    it is the one within ±`DELAY_REACH_M` that fits best, and the runner-up tells how safely.
 
     Parameters
     ----------
@@ -269,9 +486,9 @@ def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -
         phasor = np.where(seen, np.exp(2j * np.pi * np.nan_to_num(left) / wavelength), 0.0)
         mean = np.angle(phasor.sum(axis=2, keepdims=True)) / (2 * np.pi) * wavelength[0]
         return np.asarray(mean), np.zeros(left.shape[:2])
-    steps = int(np.ceil(4.0 * _DELAY_REACH_M / float(np.min(wavelength)))) + 1
+    steps = int(np.ceil(4.0 * DELAY_REACH_M / float(np.min(wavelength)))) + 1
     offsets, scores = [], []
-    for begin in np.linspace(-_DELAY_REACH_M, _DELAY_REACH_M, steps):
+    for begin in np.linspace(-DELAY_REACH_M, DELAY_REACH_M, steps):
         offset = np.full(count.shape, begin)
         for _ in range(4):
             wrapped = np.where(seen, left - offset, 0.0)
