@@ -1,5 +1,6 @@
 """Poses of rigid mirrors where ground or walls reflect."""
 
+from rfpose.multilat.ground.bound import ground_bound
 from rfpose.multilat.ground.model import LEVEL_GROUND, Reflector, Surface, fresnel_coefficient, range_shift_m
 from rfpose.multilat.ground.solve import GroundSolution, GroundStatus, solve_with_ground
 
@@ -10,6 +11,7 @@ __all__ = [
     "Reflector",
     "Surface",
     "fresnel_coefficient",
+    "ground_bound",
     "range_shift_m",
     "solve_with_ground",
 ]

@@ -329,11 +329,11 @@ def _leave(lower, info, gradient, n_own, cov, follow, schur, rest):
     """What a converged mirror hands on: covariance, how it follows the parameters, what it says about them."""
     n_parameter = schur.shape[0]
     x = np.empty(n_own)
-    for a in range(6):
+    for a in range(n_own):
         x[:] = 0.0
         x[a] = 1.0
         solve_factored(lower, x)
-        for b in range(6):
+        for b in range(n_own):
             cov[a, b] = x[b]
     for c in range(n_parameter):
         for a in range(n_own):

@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from rfpose.checks import FloatArray
+from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.ground import _kernels
+from rfpose.multilat.rigid.arrays import bias_information, clock_ties, pivot_prior, start_clock, weights
 from rfpose.multilat.rigid.integers import Observation
-from rfpose.multilat.rigid.pose import Knowledge, _bias_info, _clock_ties, _pivot_prior, _start_clock, _weights
+from rfpose.multilat.rigid.knowledge import Knowledge
 
-__all__ = ["Problem", "State", "build"]
+__all__ = ["Problem", "State", "build", "calibration_of"]
 
 IntArray = npt.NDArray[np.int64]
 
@@ -27,8 +28,8 @@ NO_TURN: FloatArray = np.zeros((1, 3))
 class State:
     """Where each mirror stands: mirror is the first axis. Changed in place by fits.
 
-    ``cov`` is at given coefficients; ``follow`` is how pose and clocks move with the coefficients, ``schur`` and
-    ``rest`` the information and gradient a mirror leaves for them.
+    ``cov`` (unknown, unknown) of pose and clocks is at given coefficients; ``follow`` is how pose and clocks move with
+    the coefficients, ``schur`` and ``rest`` the information and gradient a mirror leaves for them.
     """
 
     pivot: FloatArray
@@ -50,7 +51,7 @@ class State:
             pivot=pivot.copy(),
             rot=rot.copy(),
             clock=clock.copy(),
-            cov=np.full((n_mirror, 6, 6), np.nan),
+            cov=np.full((n_mirror, *2 * (6 + n_class * n_receiver,)), np.nan),
             follow=np.zeros((n_mirror, 6 + n_class * n_receiver, n_parameter)),
             schur=np.zeros((n_mirror, n_parameter, n_parameter)),
             rest=np.zeros((n_mirror, n_parameter)),
@@ -96,6 +97,8 @@ class Problem:
     mirrors
     calibration : (calibration receiver, xyz)
         [m]; empty where Φ does not carry their reflections.
+    calibration_share : (calibration receiver, transmitter)
+        What each has of the mean that Φ is.
     dof : (mirror,)
         Measurements and priors less a mirror's own unknowns.
     """
@@ -103,6 +106,7 @@ class Problem:
     scene: _kernels.Scene
     mirrors: _kernels.Mirrors
     calibration: FloatArray
+    calibration_share: FloatArray
     dof: FloatArray
 
     @property
@@ -138,7 +142,7 @@ class Problem:
         if len(self.calibration) and len(coefficient):
             seen = np.zeros((len(self.calibration), *scene.common.shape))
             _kernels.shifts_at_points(scene, self.calibration, seen)
-            scene = scene._replace(common=seen.mean(axis=0))
+            scene = scene._replace(common=np.einsum("ci,cigk->igk", self.calibration_share, seen))
         return scene
 
     def fit(
@@ -211,21 +215,22 @@ def build(
     *,
     calibration: FloatArray,
     known: Knowledge,
+    calibration_share: FloatArray | None = None,
 ) -> tuple[Problem, FloatArray]:
     """Lay out observations with their integers resolved; also clocks (mirror, class, receiver) that fit the poses."""
     z = np.stack(range_m, axis=1)
     n_mirror, n_group, _, n_transmitter = z.shape
-    weight = _weights(z, np.stack([np.broadcast_to(o.sigma_m, z[:, 0].shape) for o in observations], axis=1))
+    weight = weights(z, np.stack([np.broadcast_to(o.sigma_m, z[:, 0].shape) for o in observations], axis=1))
     common_sigma = np.stack(
         [np.broadcast_to(o.transmitter_sigma_m, (n_mirror, n_transmitter)) for o in observations], axis=1
     )
-    bias_info = _bias_info(common_sigma, (n_mirror, n_group, n_transmitter))
+    bias_info = bias_information(common_sigma, (n_mirror, n_group, n_transmitter))
     classes = np.array([o.clock_class for o in observations], np.int64)
     n_class = int(classes.max()) + 1
-    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
+    own, tie = clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
     seen = np.stack([np.any(weight[:, classes == k] > 0.0, axis=(1, 3)) for k in range(n_class)], axis=1)
-    prior, prior_info = _pivot_prior(known, n_mirror)
-    clock = _start_clock(scene.transmitter, places, pivot, rot, z, classes, n_class)
+    prior, prior_info = pivot_prior(known, n_mirror)
+    clock = start_clock(scene.transmitter, places, pivot, rot, z, classes, n_class)
     mirrors = _kernels.Mirrors(
         receiver_mirror=np.ascontiguousarray(places),
         z=np.nan_to_num(z),
@@ -240,7 +245,23 @@ def build(
         clock_prior=clock.copy(),
     )
     dof = _dof(weight, bias_info, seen, classes, known)
-    return Problem(scene=scene, mirrors=mirrors, calibration=calibration, dof=dof), clock
+    if calibration_share is None:
+        _, calibration_share = calibration_of(calibration, None, n_transmitter)
+    return Problem(
+        scene=scene, mirrors=mirrors, calibration=calibration, calibration_share=calibration_share, dof=dof
+    ), clock
+
+
+def calibration_of(
+    calibration_enu_m: npt.ArrayLike | None, calibration_share: npt.ArrayLike | None, n_transmitter: int
+) -> tuple[FloatArray, FloatArray]:
+    """Calibration receivers (calibration receiver, xyz), and their shares of Φ (calibration receiver, transmitter)."""
+    if calibration_enu_m is None:
+        return np.empty((0, 3)), np.empty((0, n_transmitter))
+    place = as_float_array("calibration_enu_m", calibration_enu_m, ("calibration receiver", 3))
+    if calibration_share is None:
+        return place, np.full((len(place), n_transmitter), 1.0 / max(len(place), 1))
+    return place, as_float_array("calibration_share", calibration_share, (len(place), n_transmitter))
 
 
 def _dof(

@@ -76,6 +76,10 @@ def resolve(
         if offset_m is not None:
             longest = float(np.max(observation.wavelength_m))
             offset = offset + np.rint((offset_m - offset) / longest) * longest
+        if np.isfinite(known.clock_sigma_m) and np.ptp(observation.wavelength_m) == 0.0:
+            # receivers on one clock have one offset: not half a wavelength to either side of a wrap
+            whole = float(observation.wavelength_m.flat[0])
+            offset = offset - np.rint((offset - offset[:, :1]) / whole) * whole
         left = left - offset
         risk = np.where(seen.any(axis=2), offset_risk, 0.0).sum(axis=1)
     turns = np.rint(left / observation.wavelength_m)

@@ -20,7 +20,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._coefficients import MAX_CONDITION
-from rfpose.multilat.ground._problem import NO_TURN, Problem, State, build
+from rfpose.multilat.ground._problem import NO_TURN, Problem, State, build, calibration_of
 from rfpose.multilat.ground.integers import resolve
 from rfpose.multilat.ground.model import (
     LEVEL_GROUND,
@@ -30,8 +30,9 @@ from rfpose.multilat.ground.model import (
     build_scene,
     heights_m,
 )
+from rfpose.multilat.rigid.arrays import spread_places
 from rfpose.multilat.rigid.integers import Observation
-from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, _places
+from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus
 
 __all__ = ["GroundSolution", "GroundStatus", "solve_with_ground"]
 
@@ -80,6 +81,8 @@ class GroundSolution:
     ----------
     poses
         Their covariance counts that the coefficients were estimated.
+    full_cov : (mirror, unknown, unknown)
+        The same with the clocks, in the order of `rfpose.multilat.rigid.full_covariance`.
     coefficient : (reflector,)
         Estimated or given.
     coefficient_cov : (2 × estimated, 2 × estimated)
@@ -88,6 +91,8 @@ class GroundSolution:
         Whether an observation's integers were resolved and used.
     wrong_risk : (mirror, observation)
         Probability, beforehand, that any of its integers is wrong.
+    range_m : one (mirror, receiver, transmitter) an observation
+        Resolved ranges, NaN where left out [m].
     probability_direct, probability : (mirror,)
         Of residuals as large or larger, by chance, with the direct ray alone (tones only), and with the reflections.
         A small first one says that reflections are needed.
@@ -96,10 +101,12 @@ class GroundSolution:
     """
 
     poses: RigidPoses
+    full_cov: FloatArray
     coefficient: ComplexArray
     coefficient_cov: FloatArray
     fixed: BoolArray
     wrong_risk: FloatArray
+    range_m: tuple[FloatArray, ...]
     probability_direct: FloatArray
     probability: FloatArray
     status: IntArray
@@ -115,6 +122,8 @@ def solve_with_ground(
     start_rot_enu_from_mirror: npt.ArrayLike,
     reflectors: Sequence[Reflector] = (LEVEL_GROUND,),
     calibration_enu_m: npt.ArrayLike | None = None,
+    calibration_share: npt.ArrayLike | None = None,
+    tone_count: int | None = None,
     knowledge: Knowledge | None = None,
     free_space: bool = True,
     start_sigma_m: float = 1.0,
@@ -139,8 +148,11 @@ def solve_with_ground(
     reflectors
         Planes; those without a coefficient are estimated. None at all: the direct ray alone.
     calibration_enu_m : (calibration receiver, xyz), optional
-        Where Φ was measured, as the plain mean of these receivers: the reflections there are in the ranges, and are
-        modelled.
+        Where Φ was measured, as the mean of these receivers: the reflections there are in the ranges, and are modelled.
+    calibration_share : (calibration receiver, transmitter), optional
+        What each has of that mean; they add up to one. Default: a plain mean.
+    tone_count
+        How many observations are tones; the rest are carriers. Default: those with ``clock_class`` 0.
     knowledge
         Clocks, pivot, mount.
     free_space
@@ -163,29 +175,35 @@ def solve_with_ground(
     """
     known = knowledge or Knowledge()
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    n_mirror, n_receiver = _shape(observations, len(transmitter))
-    places = _places(receiver_mirror_m, n_mirror, n_receiver)
+    n_tone = sum(o.clock_class == 0 for o in observations) if tone_count is None else tone_count
+    n_mirror, n_receiver = _shape(observations, n_tone, len(transmitter))
+    places = spread_places(receiver_mirror_m, n_mirror, n_receiver)
     pivot, rot, status = _starts(places, reflectors, start_pivot_enu_m, start_rot_enu_from_mirror)
     speed = as_positive("propagation_speed_mps", propagation_speed_mps)
     scene = build_scene(
         transmitter,
         reflectors,
         carrier_rf_hz=as_float_array("carrier_rf_hz", carrier_rf_hz, (len(transmitter),), positive=True),
-        tone_hz=np.array([_tone_hz(o, speed) for o in observations]),
+        tone_hz=np.array([_tone_hz(o, speed) if k < n_tone else 0.0 for k, o in enumerate(observations)]),
         free_space=free_space,
         propagation_speed_mps=speed,
     )
-    calibration = np.empty((0, 3))
-    if calibration_enu_m is not None:
-        calibration = as_float_array("calibration_enu_m", calibration_enu_m, ("calibration receiver", 3))
+    calibration, share = calibration_of(calibration_enu_m, calibration_share, len(transmitter))
 
     def lay_out(count: int, ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> tuple[Problem, FloatArray]:
         used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :count].copy())
         return build(
-            used, places, observations[:count], ranges[:count], pivot, rot, calibration=calibration, known=known
+            used,
+            places,
+            observations[:count],
+            ranges[:count],
+            pivot,
+            rot,
+            calibration=calibration,
+            calibration_share=share,
+            known=known,
         )
 
-    n_tone = sum(o.clock_class == 0 for o in observations)
     risk = np.ones((n_mirror, len(observations)))
     distance = np.linalg.norm(_receivers(places, pivot, rot)[:, :, None] - transmitter, axis=-1)
     ranges = []
@@ -206,7 +224,9 @@ def solve_with_ground(
     if n_tone < len(observations):
         finest, _ = lay_out(len(observations), [o.range_m for o in observations], state.pivot, state.rot)
         predicted, slope = finest.predict(state, parameter)
-        cov = _joint_covariance(state, _coefficient_cov(problem, state))
+        cov = joint_covariance(state, _coefficient_cov(problem, state))
+        pose_and_coefficients = [*range(6), *range(state.cov.shape[1], cov.shape[1])]
+        cov = cov[:, pose_and_coefficients][:, :, pose_and_coefficients]
         # a pose that does not explain its tones predicts no carrier
         sound = ~(_probability(state.chi2, problem.dof, state.status == GroundStatus.OK) < min_probability)
         for k in range(n_tone, len(observations)):
@@ -218,14 +238,14 @@ def solve_with_ground(
         problem.fit(state, parameter)
         parameter = _coefficients.refine(problem, state, parameter)
     return _solution(
-        problem, state, parameter, places, reflectors, risk, wrong_risk, probability_direct, min_probability
+        problem, state, parameter, places, reflectors, risk, ranges, wrong_risk, probability_direct, min_probability
     )
 
 
-def _shape(observations: Sequence[Observation], n_transmitter: int) -> tuple[int, int]:
+def _shape(observations: Sequence[Observation], n_tone: int, n_transmitter: int) -> tuple[int, int]:
     """Mirrors and receivers, after checks of what `Observation` does not check."""
     classes = [o.clock_class for o in observations]
-    if 0 not in classes or classes != sorted(classes):
+    if not 0 < n_tone <= len(observations) or classes != sorted(classes):
         raise InvalidInputError("`observations` must hold at least one tone, and tones before the carrier")
     shape = np.shape(observations[0].range_m)
     for k, observation in enumerate(observations):
@@ -238,9 +258,6 @@ def _shape(observations: Sequence[Observation], n_transmitter: int) -> tuple[int
 
 
 def _tone_hz(observation: Observation, speed_mps: float) -> float:
-    """Frequency of a tone; zero stands for the carrier."""
-    if observation.clock_class != 0:
-        return 0.0
     wavelength = np.asarray(observation.wavelength_m, np.float64)
     if np.ptp(wavelength) > 1e-9 * float(wavelength.max()):
         raise InvalidInputError("`wavelength_m` of a tone must be the same for all transmitters")
@@ -303,15 +320,15 @@ def _coefficient_cov(problem: Problem, state: State) -> FloatArray:
     return np.asarray(np.linalg.inv(information))
 
 
-def _joint_covariance(state: State, coefficient_cov: FloatArray) -> FloatArray:
-    """(mirror, 6 + parameter, 6 + parameter) of pose and coefficients."""
-    n_mirror, n_parameter = len(state.chi2), len(coefficient_cov)
-    follow = state.follow[:, :6]
-    out = np.empty((n_mirror, 6 + n_parameter, 6 + n_parameter))
-    out[:, :6, :6] = state.cov + follow @ coefficient_cov @ np.swapaxes(follow, 1, 2)
-    out[:, :6, 6:] = follow @ coefficient_cov
-    out[:, 6:, :6] = np.swapaxes(out[:, :6, 6:], 1, 2)
-    out[:, 6:, 6:] = coefficient_cov
+def joint_covariance(state: State, coefficient_cov: FloatArray) -> FloatArray:
+    """(mirror, unknown + parameter, unknown + parameter) of pose, clocks and coefficients."""
+    n_mirror, n_own, n_parameter = state.follow.shape
+    follow = state.follow
+    out = np.empty((n_mirror, n_own + n_parameter, n_own + n_parameter))
+    out[:, :n_own, :n_own] = state.cov + follow @ coefficient_cov @ np.swapaxes(follow, 1, 2)
+    out[:, :n_own, n_own:] = follow @ coefficient_cov
+    out[:, n_own:, :n_own] = np.swapaxes(out[:, :n_own, n_own:], 1, 2)
+    out[:, n_own:, n_own:] = coefficient_cov
     return out
 
 
@@ -322,6 +339,7 @@ def _solution(
     places: FloatArray,
     reflectors: Sequence[Reflector],
     risk: FloatArray,
+    ranges: list[FloatArray],
     wrong_risk: float,
     probability_direct: FloatArray,
     min_probability: float,
@@ -338,9 +356,11 @@ def _solution(
     dof = problem.dof - np.einsum("mab,ba->m", state.schur, coefficient_cov)
     probability = _probability(state.chi2, dof, solved)
     status[solved & (probability < min_probability)] = GroundStatus.RESIDUAL
-    cov = _joint_covariance(state, coefficient_cov)[:, :6, :6]
+    n_own = state.cov.shape[1]
+    full = joint_covariance(state, coefficient_cov)[:, :n_own, :n_own]
+    cov = full[:, :6, :6].copy()
     chi2 = state.chi2.copy()
-    for array in (state.pivot, state.rot, state.clock, cov, chi2):
+    for array in (state.pivot, state.rot, state.clock, cov, full, chi2):
         array[~solved] = np.nan
     return GroundSolution(
         poses=RigidPoses(
@@ -353,10 +373,12 @@ def _solution(
             n_iteration=state.n_iteration,
             status=_RIGID_STATUS[status],
         ),
+        full_cov=full,
         coefficient=problem.scene_at(parameter).coefficient,
         coefficient_cov=coefficient_cov,
         fixed=risk <= wrong_risk,
         wrong_risk=risk,
+        range_m=tuple(ranges),
         probability_direct=probability_direct,
         probability=probability,
         status=status,

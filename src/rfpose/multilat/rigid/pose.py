@@ -13,10 +13,18 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid import _kernels
+from rfpose.multilat.rigid.arrays import (
+    bias_information,
+    clock_ties,
+    pivot_prior,
+    spread_places,
+    start_clock,
+    weights,
+)
+from rfpose.multilat.rigid.knowledge import Knowledge
 
 __all__ = ["Knowledge", "RigidPoses", "RigidStatus", "full_covariance", "rigid_bound", "solve_rigid", "tilt_sigma_rad"]
 
@@ -44,32 +52,6 @@ class RigidStatus(IntEnum):
             "no starting pose",
             "fewer measurements than unknowns",
         )[self]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Knowledge:
-    """What is known about mirrors besides the phases.
-
-    Attributes
-    ----------
-    clock_sigma_m
-        Standard deviation of each receiver's delay about the mirror's common clock [m]: 0 means one shared clock
-        with known delays, infinity one unknown clock a receiver.
-    pivot_enu_m : (mirror, xyz) or None
-        Surveyed pivots [m].
-    pivot_sigma_m
-        Their standard deviation in each axis [m].
-    two_axis
-        The mirror stands on an azimuth-elevation mount: its x axis stays horizontal.
-    roll_sigma_rad
-        How well it does.
-    """
-
-    clock_sigma_m: float = np.inf
-    pivot_enu_m: FloatArray | None = None
-    pivot_sigma_m: float = np.inf
-    two_axis: bool = False
-    roll_sigma_rad: float = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,16 +147,16 @@ def solve_rigid(
     n_mirror, n_group, n_receiver, n_transmitter = z.shape
     if n_transmitter != len(transmitter):
         raise InvalidInputError(f"`range_m` has {n_transmitter} transmitters, `transmitter_enu_m` {len(transmitter)}")
-    places = _places(receiver_mirror_m, n_mirror, n_receiver)
-    weight = _weights(z, sigma_m)
-    bias_info = _bias_info(transmitter_sigma_m, (n_mirror, n_group, n_transmitter))
+    places = spread_places(receiver_mirror_m, n_mirror, n_receiver)
+    weight = weights(z, sigma_m)
+    bias_info = bias_information(transmitter_sigma_m, (n_mirror, n_group, n_transmitter))
     classes = np.asarray(clock_class, np.int64)
     n_class = int(classes.max()) + 1
-    pivot_prior, pivot_info = _pivot_prior(known, n_mirror)
-    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
+    prior, pivot_info = pivot_prior(known, n_mirror)
+    own, tie = clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
     pivot = np.array(np.broadcast_to(np.asarray(start_pivot_enu_m, np.float64), (n_mirror, 3)))
     rot = np.array(np.broadcast_to(np.asarray(start_rot_enu_from_mirror, np.float64), (n_mirror, 3, 3)))
-    clock = _start_clock(transmitter, places, pivot, rot, z, classes, n_class)
+    clock = start_clock(transmitter, places, pivot, rot, z, classes, n_class)
     status = np.zeros(n_mirror, np.int64)
     seen = np.sum(weight > 0, axis=(1, 2, 3))
     status[seen < 4] = RigidStatus.TOO_FEW
@@ -189,7 +171,7 @@ def solve_rigid(
         weight,
         bias_info,
         classes,
-        pivot_prior,
+        prior,
         pivot_info,
         known.roll_sigma_rad**-2 if known.two_axis else 0.0,
         own,
@@ -289,15 +271,15 @@ def full_covariance(
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
     sigma = as_float_array("sigma_m", sigma_m, ("mirror", "group", "receiver", "transmitter"), finite=False)
     n_mirror, n_group, n_receiver, n_transmitter = sigma.shape
-    places = _places(receiver_mirror_m, n_mirror, n_receiver)
-    weight = _weights(np.where(np.isfinite(sigma), 0.0, np.nan), np.where(np.isfinite(sigma), sigma, 1.0))
+    places = spread_places(receiver_mirror_m, n_mirror, n_receiver)
+    weight = weights(np.where(np.isfinite(sigma), 0.0, np.nan), np.where(np.isfinite(sigma), sigma, 1.0))
     classes = np.asarray(clock_class, np.int64)
     n_class = int(classes.max()) + 1
-    bias_info = _bias_info(transmitter_sigma_m, (n_mirror, n_group, n_transmitter))
-    _, pivot_info = _pivot_prior(known, n_mirror)
+    bias_info = bias_information(transmitter_sigma_m, (n_mirror, n_group, n_transmitter))
+    _, pivot_info = pivot_prior(known, n_mirror)
     n_unknown = 6 + n_class * n_receiver
     cov = np.full((n_mirror, n_unknown, n_unknown), np.nan)
-    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
+    own, tie = clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
     _kernels.covariance_many(
         transmitter,
         places,
@@ -314,89 +296,6 @@ def full_covariance(
         cov,
     )
     return cov
-
-
-def _places(receiver_mirror_m: npt.ArrayLike, n_mirror: int, n_receiver: int) -> FloatArray:
-    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("...", n_receiver, 3))
-    for mirror in places.reshape(-1, n_receiver, 3)[:1]:
-        if n_receiver < 3 or geometry.is_collinear(mirror):
-            raise GeometryError("`receiver_mirror_m` must hold three or more receivers that are not on a line")
-    return np.array(np.broadcast_to(places, (n_mirror, n_receiver, 3)))
-
-
-def _weights(z: FloatArray, sigma_m: npt.ArrayLike) -> FloatArray:
-    sigma = np.broadcast_to(np.asarray(sigma_m, np.float64), z.shape)
-    if np.any(sigma <= 0.0):
-        raise InvalidInputError("`sigma_m` must be greater than zero")
-    return np.where(np.isfinite(z) & np.isfinite(sigma), 1.0 / np.where(np.isfinite(sigma), sigma, 1.0) ** 2, 0.0)
-
-
-def _bias_info(transmitter_sigma_m: npt.ArrayLike, shape: tuple[int, int, int]) -> FloatArray:
-    sigma = np.broadcast_to(np.asarray(transmitter_sigma_m, np.float64), shape)
-    with np.errstate(divide="ignore"):
-        return np.array(np.where(np.isnan(sigma), 0.0, 1.0 / sigma**2))
-
-
-def _pivot_prior(known: Knowledge, n_mirror: int) -> tuple[FloatArray, FloatArray]:
-    info = np.zeros((n_mirror, 3, 3))
-    if known.pivot_enu_m is None:
-        return np.zeros((n_mirror, 3)), info
-    if np.isfinite(known.pivot_sigma_m):
-        info[:] = np.eye(3) / known.pivot_sigma_m**2
-    return np.array(np.broadcast_to(known.pivot_enu_m, (n_mirror, 3))), info
-
-
-def _clock_ties(
-    clock_sigma_m: float,
-    weight: FloatArray,
-    bias_info: FloatArray,
-    classes: npt.NDArray[np.int64],
-    n_class: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Information on each clock and on the differences between clocks.
-
-    Clocks c + δ_r with δ_r of standard deviation s have differences of information 1/(R s²) a pair. Where no
-    transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says nothing.
-    """
-    n_mirror, _, n_receiver, _ = weight.shape
-    # each mirror's own scale, so that no mirror's result depends on its neighbours
-    largest = np.maximum(weight.max(axis=(1, 2, 3), initial=0.0), 1e-300)
-    own = np.zeros((n_mirror, n_class, n_receiver))
-    for k in range(n_class):
-        known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
-        own[:, k, 0] = np.where(known, 0.0, largest)
-        # a clock that nothing observes is held as well; it takes part in nothing
-        seen = np.any(weight[:, classes == k] > 0.0, axis=(1, 3))
-        if np.isfinite(clock_sigma_m):
-            own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
-        else:
-            own[:, k] = np.where(seen, own[:, k], largest[:, None])
-    tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
-    if np.isfinite(clock_sigma_m):
-        tie[:] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None, None]
-    return own, tie
-
-
-def _start_clock(
-    transmitter: FloatArray,
-    places: FloatArray,
-    pivot: FloatArray,
-    rot: FloatArray,
-    z: FloatArray,
-    classes: npt.NDArray[np.int64],
-    n_class: int,
-) -> FloatArray:
-    """One common clock a mirror and class that fits the start pose: the mean of range less distance."""
-    receiver = pivot[:, None] + np.einsum("mab,mrb->mra", rot, places)
-    distance = np.linalg.norm(receiver[:, :, None] - transmitter, axis=-1)
-    out = np.zeros((len(z), n_class, places.shape[1]))
-    for k in range(n_class):
-        left = z[:, classes == k] - distance[:, None]
-        seen = np.isfinite(left)
-        count = seen.sum(axis=(1, 2, 3))
-        total = np.where(seen, left, 0.0).sum(axis=(1, 2, 3))
-        out[:, k] = np.where(count > 0, total / np.maximum(count, 1), 0.0)[:, None]
-    return out
 
 
 def _dof(
