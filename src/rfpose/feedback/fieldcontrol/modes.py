@@ -192,7 +192,9 @@ _WHY_EVENT: dict[Event, str] = {
     Event.REFOCUS: "it is not defocused",
 }
 # where the mode's reason tells more than the event's
-_MODE_SAYS_MORE = frozenset({Mode.STOW, Mode.STOWING, Mode.POWER_LOSS, Mode.FAULT, Mode.EMERGENCY, Mode.IDLE})
+_MODE_SAYS_MORE = frozenset(
+    {Mode.STOW, Mode.STOWING, Mode.APPROACH, Mode.POWER_LOSS, Mode.FAULT, Mode.EMERGENCY, Mode.IDLE}
+)
 
 
 def refusal(mode: Mode, command: Event) -> str | None:
