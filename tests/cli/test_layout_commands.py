@@ -2,6 +2,7 @@
 
 import csv
 import json
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,12 @@ from click.testing import CliRunner
 from rfpose.cli._support import Session
 from rfpose.cli.layout import command
 from rfpose.errors import GeometryError, ScenarioError
+from rfpose.geometry import enu_from_azimuth_elevation
+from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
-from rfpose.pipeline.layout import map_layout, optimise_layout
+from rfpose.layout.sight import Plates, visible
+from rfpose.pipeline.layout import Rules, budget_layout, map_layout, optimise_layout
+from rfpose.pipeline.layout.site import Postures
 from rfpose.scenario import load_scenario
 
 SITE = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -66,8 +71,144 @@ def test_optimise_writes_a_scenario(tmp_path):
     assert measured == pytest.approx(found["pdop_rms"], rel=1e-9)
 
 
+def placed(tmp_path):
+    """Table 2's field, somewhere on Earth."""
+    return broken(tmp_path, "[site]\n", "[site]\nlatitude_deg = -33.9\nlongitude_deg = 18.9\n")
+
+
+def test_map_over_a_day_by_posture(tmp_path):
+    site = placed(tmp_path)
+    found = json.loads(run("map", site, "--json", "--estimator", "rigid", "--day", "2026-06-21", "--stow"))
+    by_posture = found["normal_by_posture_mrad"]["rigid"]
+    names = list(by_posture)
+    assert names[-1] == "stow"
+    # winter solstice at 33.9° S: from 9:05 to 16:40 local solar time the sun is above 5° and more
+    assert names[0] < "2026-06-21 07:00Z"
+    assert names[-2] > "2026-06-21 14:00Z"
+    assert len(names) == found["postures"]
+    together = np.sqrt(np.mean(np.square(list(by_posture.values()))))
+    assert found["normal_mrad"]["rigid"]["rms"] == pytest.approx(together)
+    year = json.loads(run("map", site, "--json", "--estimator", "rigid", "--year", 2026))
+    assert {name[:7] for name in year["normal_by_posture_mrad"]["rigid"]} == {f"2026-{m:02d}" for m in range(1, 13)}
+    with pytest.raises(ScenarioError, match="latitude_deg"):
+        map_layout(SITE, postures=Postures(day=date(2026, 6, 21)))
+
+
+def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
+    table = tmp_path / "map.csv"
+    plate = ("--line-of-sight", 4, 4, "--sun", 170, 40, "--estimator", "shared-clock")
+    found = json.loads(run("map", SITE, "--json", "--csv", table, *plate))
+    scenario = load_scenario(SITE)
+    sun = enu_from_azimuth_elevation(np.radians(170.0), np.radians(40.0))
+    mirrors = maps.mirrors_of(scenario, sun_enu=sun)
+    seen = visible(scenario.transmitter_enu_m, mirrors, Plates(width_m=4.0, height_m=4.0))
+    bound = maps.normal_map(
+        scenario.transmitter_enu_m, mirrors, maps.noise_of(scenario), ESTIMATORS["shared-clock"], visible=seen
+    )
+    assert 0 < (~seen).sum() < seen.size
+    sight = found["line_of_sight"]
+    assert sight["seen_mean"] == pytest.approx(seen.sum(axis=2).mean())
+    assert sight["seen_least"] == seen.sum(axis=2).min()
+    assert found["normal_mrad"]["shared-clock"]["undetermined"] == pytest.approx(np.isnan(bound).mean())
+    assert found["normal_mrad"]["shared-clock"]["rms"] == pytest.approx(1e3 * np.sqrt(np.nanmean(bound**2)))
+    assert min(found["normal_without_transmitter_mrad"]["shared-clock"].values()) > 0.0
+    with table.open() as file:
+        assert [float(row["seen_least"]) for row in csv.DictReader(file)] == seen.sum(axis=2).min(axis=1).tolist()
+    behind = json.loads(run("map", SITE, "--json", "--behind", *plate))["line_of_sight"]
+    # front and back share the sky
+    assert behind["seen_mean"] + sight["seen_mean"] == pytest.approx(10.0, abs=0.5)
+
+
+def test_map_says_what_each_transmitter_means():
+    found = json.loads(run("map", SITE, "--json", "--estimator", "rigid", "--sensitivity"))
+    one = found["sensitivity"]["rigid"]
+    assert set(one) == set(load_scenario(SITE).transmitter_ids)
+    for name, lost in found["normal_without_transmitter_mrad"]["rigid"].items():
+        assert one[name]["lost_mrad"] == pytest.approx(lost)
+        assert all(x > 0.0 for x in one[name]["survey_mrad_per_mm"])
+
+
+def test_budget_writes_json_csv_and_picture(tmp_path):
+    table, picture = tmp_path / "budget.csv", tmp_path / "budget.svg"
+    found = json.loads(run("budget", SITE, "--json", "-o", table, "--picture", picture, "--draws", 40))
+    shares = [line["share"] for line in found["lines"]]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) == pytest.approx(1.0)
+    assert found["sum_over_monte_carlo"] == pytest.approx(1.0, abs=0.2)
+    assert all(line["remedy"] and line["assumed"] for line in found["lines"])
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    own = [row for row in rows if row["source"] == found["lines"][0]["source"]]
+    assert [row["heliostat"] for row in own] == ["field", *load_scenario(SITE).heliostat_ids]
+    each = [float(row["target_m"]) for row in own]
+    assert each[0] == pytest.approx(np.sqrt(np.mean(np.square(each[1:]))), rel=1e-4)
+    assert b"error budget" in picture.read_bytes() or picture.read_bytes().startswith(b"<?xml")
+
+
+def test_budget_without_draws_and_over_postures():
+    one = json.loads(run("budget", SITE, "--json", "--draws", 0, "--sun", 120, 40))
+    assert one["monte_carlo"]["normal_mrad"] is None
+    two = json.loads(run("budget", SITE, "--json", "--draws", 0, "--sun", 120, 40, "--sun", 200, 60))
+    other = json.loads(run("budget", SITE, "--json", "--draws", 0, "--sun", 200, 60))
+    mean = np.sqrt(0.5 * (one["sum"]["normal_mrad"] ** 2 + other["sum"]["normal_mrad"] ** 2))
+    assert two["sum"]["normal_mrad"] == pytest.approx(mean)
+
+
+def test_curve_over_numbers_of_transmitters(tmp_path):
+    table, picture = tmp_path / "curve.csv", tmp_path / "curve.png"
+    wanted = ("--pareto", "6..8", "--starts", 1, "--cost", 5, 0.1, 0.01, "--csv", table, "--picture", picture)
+    found = json.loads(run("optimise", SITE, "--json", *wanted))
+    rows = found["placements"]
+    assert [row["transmitters"] for row in rows] == [6, 7, 8]
+    assert all(row["without_worst"] is None or row["without_worst"] > row["value"] for row in rows)
+    assert np.diff([row["cost"] for row in rows]).min() > 0.0
+    with table.open() as file:
+        got = [float(row["pdop_rms"]) for row in csv.DictReader(file)]
+    assert got == pytest.approx([row["value"] for row in rows], rel=1e-5)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_ground_by_outline_and_circles(tmp_path):
+    outline = tmp_path / "ground.csv"
+    outline.write_text("east_m,north_m\n0,-120\n120,-120\n120,120\n0,120\n")
+    found = json.loads(
+        run("optimise", SITE, "--json", "--starts", 1, "-n", 6, "--outline", outline, "--exclude", 60, 0, 40)
+    )
+    place = np.array(list(found["transmitters"].values()))
+    assert place[:, 0].min() >= -1e-3
+    assert np.hypot(place[:, 0] - 60.0, place[:, 1]).min() >= 40.0 - 1e-3
+    apart = np.linalg.norm(place[:, None, :2] - place[:, :2], axis=2) + 1e9 * np.eye(6)
+    # towers keep a twentieth of the radius from each other by default
+    assert apart.min() >= 5.0 - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("optimise", SITE, "--pareto", "8..6"), "6..12"),
+        (("optimise", SITE, "--csv", "x.csv"), "go with --pareto"),
+        (("optimise", SITE, "--pareto", "6..7", "-n", 8), "give -o and -n without it"),
+        (("map", SITE, "--tower", 2, 40), "--line-of-sight"),
+    ],
+)
+def test_options_that_contradict_are_refused(arguments, text):
+    result = CliRunner().invoke(command, [str(a) for a in arguments], obj=Session())
+    assert result.exit_code == 2
+    assert text in result.output
+
+
+def test_undetermined_poses_have_no_budget(tmp_path):
+    text = SITE.read_text()
+    begin, end = text.index("[[calibration_receiver]]"), text.index("[mirror]")
+    path = tmp_path / "site.toml"
+    path.write_text(text[:begin] + text[end:])
+    with pytest.raises(ScenarioError, match="calibration receiver, or a surveyed pivot"):
+        budget_layout(path, pose="independent", n_draw=0)
+
+
 def test_a_person_gets_tables():
     assert "PDOP" in run("map", SITE, "--estimator", "rigid")
+    assert "receiver places" in run("budget", SITE, "--draws", 5)
 
 
 def broken(tmp_path, old, new):
@@ -105,4 +246,4 @@ def test_level_transmitters_are_refused(tmp_path):
 
 def test_constraints_that_cannot_be_met_are_refused():
     with pytest.raises((ScenarioError, GeometryError), match="no room"):
-        optimise_layout(SITE, separation_m=150.0, starts=1)
+        optimise_layout(SITE, rules=Rules(separation_m=150.0), starts=1)

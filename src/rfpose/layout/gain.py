@@ -193,7 +193,8 @@ def _independent(
     u = _directions(transmitter, mirrors)[:, None]
     weight = 1.0 / (sigma**2 + common[:, None] ** 2)
     mean = np.einsum("mgrt,mgrta->mgra", weight, np.broadcast_to(u, (*sigma.shape, 3)))
-    centred = u - (mean / weight.sum(axis=3)[..., None])[:, :, :, None]
+    total = weight.sum(axis=3)[..., None]
+    centred = u - (mean / np.where(total > 0.0, total, 1.0))[:, :, :, None]
     rows = weight[..., None] * centred
     place_gain = _inverse(np.einsum("mgrta,mgrtb->mrab", rows, centred))
     slope = np.broadcast_to(_plane_slope(mirrors.receiver_mirror_m), (n_mirror, n_receiver, 3, 3))[:, :, :2]

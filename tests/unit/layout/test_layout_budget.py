@@ -1,4 +1,4 @@
-"""The error budget: lines and their sum against Monte Carlo through the solvers, and single sources against formulas."""
+"""The error budget: lines and sum against Monte Carlo through the solvers, single sources against formulas."""
 
 from pathlib import Path
 

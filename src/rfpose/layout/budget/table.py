@@ -119,7 +119,7 @@ def error_budget(
     whole = _line("all together", "", "", total, drawn, to_target)
     if progress is not None:
         progress(len(sources) + 1, len(sources) + 1)
-    lines.sort(key=lambda line: -float(np.nanmean(line.normal_rad**2)))
+    lines.sort(key=lambda line: -float(np.sum(np.nan_to_num(line.normal_rad) ** 2)))
     return ErrorBudget(lines=tuple(lines), whole=whole, n_draw=n_draw, n_failed=n_failed + failed, plan=plan)
 
 

@@ -10,8 +10,8 @@ from rfpose.jit import kernel, kernel_parallel
 
 
 @kernel
-def plate_hides(ax, ay, az, bx, by, bz, centre, rot, half_x, half_y):
-    """Whether the way from a to b crosses a rectangle of half sides (half_x, half_y) in its own x-y plane."""
+def plate_hides(ax, ay, az, bx, by, bz, centre, rot, half_x, half_y, disc):
+    """Whether the way from a to b crosses a rectangle of half sides (half_x, half_y), or a disc of radius half_x."""
     nx, ny, nz = rot[0, 2], rot[1, 2], rot[2, 2]
     da = (ax - centre[0]) * nx + (ay - centre[1]) * ny + (az - centre[2]) * nz
     db = (bx - centre[0]) * nx + (by - centre[1]) * ny + (bz - centre[2]) * nz
@@ -23,6 +23,8 @@ def plate_hides(ax, ay, az, bx, by, bz, centre, rot, half_x, half_y):
     z = az + f * (bz - az) - centre[2]
     along_x = x * rot[0, 0] + y * rot[1, 0] + z * rot[2, 0]
     along_y = x * rot[0, 1] + y * rot[1, 1] + z * rot[2, 1]
+    if disc:
+        return along_x * along_x + along_y * along_y < half_x * half_x
     return abs(along_x) < half_x and abs(along_y) < half_y
 
 
@@ -55,7 +57,9 @@ def tower_hides(ax, ay, az, bx, by, bz, tower):
 
 
 @kernel
-def neighbours_hide(m, ax, ay, az, bx, by, bz, centre, rot, half_x, half_y, reach, top, x0, y0, cell, start, member):
+def neighbours_hide(
+    m, ax, ay, az, bx, by, bz, centre, rot, half_x, half_y, disc, reach, top, x0, y0, cell, start, member
+):
     """Whether any plate but ``m`` stands in the way; walks along the ray through cells of side ``cell``."""
     n_column, n_row = start.shape[0], start.shape[1] - 1
     dx, dy, dz = bx - ax, by - ay, bz - az
@@ -88,27 +92,46 @@ def neighbours_hide(m, ax, ay, az, bx, by, bz, centre, rot, half_x, half_y, reac
                     gx, gy, gz = cx - t * dx, cy - t * dy, cz - t * dz
                     if gx * gx + gy * gy + gz * gz > reach * reach:
                         continue
-                    if plate_hides(ax, ay, az, bx, by, bz, centre[o], rot[o], half_x, half_y):
+                    if plate_hides(ax, ay, az, bx, by, bz, centre[o], rot[o], half_x, half_y, disc):
                         return True
     return False
 
 
 @kernel_parallel
 def visible_rows(
-    transmitter, receiver, centre, rot, half_x, half_y, reach, top, tower, x0, y0, cell, start, member, out
+    transmitter, receiver, who, centre, rot, half_x, half_y, disc, reach, top, tower, x0, y0, cell, start, member, out
 ):
-    """Fill ``out`` (mirror, receiver, transmitter) with one where the way is free."""
-    n_mirror, n_receiver, n_transmitter = out.shape
-    for m in numba.prange(n_mirror):
+    """Fill ``out`` (row, receiver, transmitter) with one where the way is free; row i belongs to plate ``who[i]``."""
+    n_row, n_receiver, n_transmitter = out.shape
+    for i in numba.prange(n_row):
+        m = who[i]
         for r in range(n_receiver):
-            ax, ay, az = receiver[m, r, 0], receiver[m, r, 1], receiver[m, r, 2]
+            ax, ay, az = receiver[i, r, 0], receiver[i, r, 1], receiver[i, r, 2]
             for t in range(n_transmitter):
                 bx, by, bz = transmitter[t, 0], transmitter[t, 1], transmitter[t, 2]
-                hidden = plate_hides(ax, ay, az, bx, by, bz, centre[m], rot[m], half_x, half_y)
+                hidden = plate_hides(ax, ay, az, bx, by, bz, centre[m], rot[m], half_x, half_y, disc)
                 if not hidden:
                     hidden = tower_hides(ax, ay, az, bx, by, bz, tower)
                 if not hidden:
                     hidden = neighbours_hide(
-                        m, ax, ay, az, bx, by, bz, centre, rot, half_x, half_y, reach, top, x0, y0, cell, start, member
+                        m,
+                        ax,
+                        ay,
+                        az,
+                        bx,
+                        by,
+                        bz,
+                        centre,
+                        rot,
+                        half_x,
+                        half_y,
+                        disc,
+                        reach,
+                        top,
+                        x0,
+                        y0,
+                        cell,
+                        start,
+                        member,
                     )
-                out[m, r, t] = 0 if hidden else 1
+                out[i, r, t] = 0 if hidden else 1
