@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,12 +16,14 @@ from rfpose.dsp.calibration import wrap
 from rfpose.dsp.hilbert import analytic_tones, centred_streams
 from rfpose.errors import RecordingError
 from rfpose.recording import Recording, frame_starts, recorded_runs
+from rfpose.recording.base import IndexArray, IqArray
 from rfpose.scenario import Scenario
 
 __all__ = [
     "FrameLook",
     "LineHealth",
     "PhaseTrack",
+    "SharedRecording",
     "Spectrum",
     "Waterfall",
     "line_health",
@@ -159,6 +162,50 @@ class PhaseTrack:
             middle = float(np.angle(np.mean(np.exp(1j * step[seen]))))
             step = middle + wrap(step - middle)
         return step, np.hypot(sigma[:, 0], sigma[:, 1])
+
+
+class SharedRecording(Recording):
+    """A recording that several threads may read: not every format's library can be called by two at once.
+
+    Closing it, with the recording inside, waits for a read under way; reading it afterwards raises RecordingError.
+    """
+
+    def __init__(self, inner: Recording) -> None:
+        super().__init__(
+            inner.path,
+            format=inner.format,
+            receiver_ids=inner.receiver_ids,
+            sample_rate=inner.sample_rate,
+            centre_frequency_hz=inner.centre_frequency_hz,
+            sample_format=inner.sample_format,
+            full_scale=inner.full_scale,
+            scenario=inner.scenario,
+            truth=inner.truth,
+            provenance=inner.provenance,
+        )
+        self._inner = inner
+        self._lock = threading.RLock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Close the recording inside."""
+        with self._lock:
+            self._closed = True
+            self._inner.close()
+
+    def _load_segments(self, receiver_id: str) -> IndexArray:
+        with self._lock:
+            self._refuse_closed()
+            return self._inner._load_segments(receiver_id)
+
+    def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
+        with self._lock:
+            self._refuse_closed()
+            self._inner._read_segment(receiver_id, i_segment, skip, out)
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise RecordingError(f"{self.path}: was closed; open it again")
 
 
 def viewing_frames(recording: Recording, scenario: Scenario | None) -> tuple[npt.NDArray[np.int64], int]:

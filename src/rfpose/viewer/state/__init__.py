@@ -1,0 +1,1 @@
+"""What the viewer shows and what its user has chosen, without Qt: views observe it."""

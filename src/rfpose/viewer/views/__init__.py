@@ -1,0 +1,1 @@
+"""The widgets: each observes the session and holds nothing that must outlive it."""
