@@ -4,15 +4,19 @@ from rfpose.multilat.bounds import dop, normal_bound, position_bound, tilt_rms_f
 from rfpose.multilat.fix import Fixes, FixStatus, locate
 from rfpose.multilat.normal import Normals, Poses, PoseStatus, joint_covariance, mirror_normal, solve_poses
 from rfpose.multilat.ranges import RangeDifferences, RangeStatus, check_unambiguous, range_differences
+from rfpose.multilat.tracking import Motion, TrackedPoses, TrackStatus, track_poses
 
 __all__ = [
     "FixStatus",
     "Fixes",
+    "Motion",
     "Normals",
     "PoseStatus",
     "Poses",
     "RangeDifferences",
     "RangeStatus",
+    "TrackStatus",
+    "TrackedPoses",
     "check_unambiguous",
     "dop",
     "joint_covariance",
@@ -23,4 +27,5 @@ __all__ = [
     "range_differences",
     "solve_poses",
     "tilt_rms_from_position",
+    "track_poses",
 ]
