@@ -42,7 +42,7 @@ _SERIES = {
     "normal_enu": ("1", "time, stored, xyz", "true normals of the stored mirrors"),
     "error_rad": ("rad", "time, stored", "angle between true and wanted normal"),
     "motor_count": ("steps", "time, stored, axis", "motor positions"),
-    "offset_rad": ("rad", "time, stored, axis", "what feedback turned the axes further than the model"),
+    "shift_enu": ("rad", "time, stored, xyz", "what feedback adds to the normal that the model is asked for"),
 }
 _SCORES = {
     "heliostat_rms_rad": ("rad", "heliostat", "normal error, rms over all days"),
@@ -74,7 +74,7 @@ class MethodTrack:
         Of the method.
     series
         ``rms_rad``, ``p95_rad``, ``worst_rad`` (time,); ``normal_enu`` (time, stored, xyz), ``error_rad`` (time,
-        stored), ``motor_count``, ``offset_rad`` (time, stored, axis).
+        stored), ``motor_count`` (time, stored, axis), ``shift_enu`` (time, stored, xyz).
     scores
         ``heliostat_…`` (heliostat,), ``hour_rms_rad`` (24,), ``day_…`` (day,).
     summary

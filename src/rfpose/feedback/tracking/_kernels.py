@@ -18,12 +18,12 @@ from rfpose.jit import kernel, kernel_parallel
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
 # state of a mirror under one method
-MOTOR, AXIS, COMMAND, NEXT, OFFSET, RAMP, MOVED, INNOVATION = 0, 2, 4, 6, 8, 10, 12, 14
-LEARNED, SILENT, STARTED, UNREACHABLE = 16, 17, 18, 19
-N_STATE = 20
+MOTOR, AXIS, COMMAND, NEXT, SLIP, MOVED, INNOVATION, SHIFT, RAMP = 0, 2, 4, 6, 8, 10, 12, 14, 17
+LEARNED, SILENT, STARTED, UNREACHABLE = 20, 21, 22, 23
+N_STATE = 24
 
 # a measurement on its way
-N_RING, N_ENTRY = 16, 5
+N_RING, N_ENTRY = 16, 6
 
 # what is added up over a day
 (
@@ -37,7 +37,7 @@ LOWEST_RAD = 1e-6
 
 _NEAR_ZENITH = 0.05
 _LIMIT_RAD = 0.1
-"""No feedback turns a mirror further than this away from its model."""
+"""Feedback shifts a normal no further than this, in each direction."""
 
 
 class Loop(NamedTuple):
@@ -52,7 +52,7 @@ class Loop(NamedTuple):
     dead_band: float
     speed: float
     leak: float
-    """Part of the offset kept from one silent frame to the next, once silence lasts."""
+    """Part of the shift kept from one silent frame to the next, once silence lasts."""
     learn: int
     """Frames between two steps of the rolling fit; 0: none."""
     wind_variance: float
@@ -94,6 +94,15 @@ def _across(n, e, out):
     out[0] = (-n[1] * e[0] + n[0] * e[1]) / h
     out[1] = -(n[0] * e[0] + n[1] * e[1]) * n[2] / h + h * e[2]
     return max(h, _NEAR_ZENITH)
+
+
+@kernel
+def _along(n, right, up, out):
+    """Write the vector with these parts along the mirror's right and up."""
+    h = max(math.hypot(n[0], n[1]), 1e-9)
+    out[0] = (-n[1] * right - n[0] * n[2] * up) / h
+    out[1] = (n[0] * right - n[1] * n[2] * up) / h
+    out[2] = h * up
 
 
 @kernel
@@ -163,6 +172,24 @@ def _command(p, k, prepared, row, sun, out, work):
 
 
 @kernel
+def _nearest_turn(near, k, counts):
+    """Take axis 1 the whole turns on that bring it nearest to where it is, if its limits allow."""
+    turn = 2.0 * math.pi * k[13]
+    moved = counts[0] + turn * math.floor((near - counts[0]) / turn + 0.5)
+    if k[22] <= moved <= k[23]:
+        counts[0] = moved
+
+
+@kernel
+def _shifted(p, k, prepared, shift, counts, guess, row, work):
+    """Move counts so that the model's normal is turned by a small vector; True where the mirror can reach that."""
+    _posture(_axis(0, counts[0], p, k, prepared), _axis(1, counts[1], p, k, prepared), p, prepared, 0.0, guess)
+    for i in range(3):
+        row[i] = row[4 + i] = guess[i] + shift[i]
+    return _command_one(p, k, prepared, row, counts, work[0], work[1], work[2][:3]) == 0
+
+
+@kernel
 def _track(
     loop, step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
     bias, lost, outage, power, backlash, stiction, drift, sensor, state, ring, total, hours, hour_of, histogram,
@@ -173,18 +200,21 @@ def _track(
     known = np.empty(16)
     work = np.empty((3, 6))
     true = np.empty(6)
-    guess = np.empty(6)
+    guess = np.ones(6)
     wanted = np.empty(3)
     hoped = np.empty(3)
     error = np.empty(3)
     across = np.empty(2)
     counts = np.empty(2)
+    change = np.empty(3)
     row = np.zeros(10)
     is_dish = target[3] > 0.5
     row[4:7] = target[:3]
     row[7] = 0.0 if is_dish else 1.0
     row[8] = 1.0
     row[9] = target[3]
+    aside = np.zeros(10)  # a row whose light comes from and goes to one direction
+    aside[8] = 1.0
     lean_north, lean_east = p[0], p[1]
     plate_up, plate_right = p[29], p[30]
     _prepare(model, k, known)
@@ -205,6 +235,10 @@ def _track(
                 state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
             reached = _command(model, k, known, row, sun[s + loop.interval], counts, work) and reached
+            shift = state[SHIFT : SHIFT + 3]
+            if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
+                reached = _shifted(model, k, known, shift, counts, guess, aside, work)
+            _nearest_turn(state[COMMAND], k, counts)
             if reached:
                 state[NEXT], state[NEXT + 1] = counts[0], counts[1]
                 state[UNREACHABLE] = 0.0
@@ -227,45 +261,63 @@ def _track(
             seconds = loop.interval * loop.servo_s
             if entry[0] > 0.5:
                 state[SILENT] = 0.0
+                busy = False
                 for a in range(2):
-                    counts_off = abs(state[COMMAND + a] + state[OFFSET + a] * k[13 + a] - state[MOTOR + a])
-                    if counts_off <= loop.speed:  # no winding up while the motor runs flat out
-                        state[RAMP + a] += loop.integral * seconds * entry[1 + a]
-                    step_rad = seconds * (loop.gain * entry[1 + a] + state[RAMP + a])
-                    state[OFFSET + a] = min(max(state[OFFSET + a] + step_rad, -_LIMIT_RAD), _LIMIT_RAD)
+                    busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > loop.speed
+                if loop.feedback == ENCODER:
+                    for a in range(2):
+                        state[SLIP + a] += seconds * loop.gain * entry[1 + a]
+                elif not busy:  # a motor that runs flat out is on its way: nothing winds up meanwhile
+                    for i in range(3):
+                        state[RAMP + i] += loop.integral * seconds * entry[1 + i]
+                        change[i] = state[SHIFT + i]
+                        moved = change[i] + seconds * (loop.gain * entry[1 + i] + state[RAMP + i])
+                        state[SHIFT + i] = min(max(moved, -_LIMIT_RAD), _LIMIT_RAD)
+                        change[i] = state[SHIFT + i] - change[i]
+                    # at once, to first order; exact from the next command on
+                    h = _across(guess, change, across)
+                    for a in range(2):
+                        turn = -across[0] / h if a == 0 else across[1]
+                        state[COMMAND + a] += turn * k[13 + a]
+                        state[NEXT + a] += turn * k[13 + a]
                 if loop.learn > 0:
-                    state[INNOVATION] += entry[3]
-                    state[INNOVATION + 1] += entry[4]
+                    state[INNOVATION] += entry[4]
+                    state[INNOVATION + 1] += entry[5]
                     state[LEARNED] += 1.0
             else:
                 state[SILENT] += 1.0
-                if state[SILENT] <= 5.0:
-                    for a in range(2):
-                        state[OFFSET + a] += seconds * state[RAMP + a]
-                else:
-                    for a in range(2):
-                        state[RAMP + a] = 0.0
-                        state[OFFSET + a] *= loop.leak
+                for i in range(3):
+                    if state[SILENT] <= 5.0:
+                        state[SHIFT + i] += seconds * state[RAMP + i]
+                    else:
+                        state[RAMP + i] = 0.0
+                        state[SHIFT + i] *= loop.leak
             if loop.learn > 0 and state[LEARNED] >= loop.learn:
                 m = state[LEARNED]
-                counts[0], counts[1] = state[MOTOR], state[MOTOR + 1]
                 across[0], across[1] = state[INNOVATION] / m, state[INNOVATION + 1] / m
                 own = 0.5 * (spread[0] * spread[0] + spread[1] * spread[1] + spread[2] * spread[2])
-                _learn(
-                    model, k, counts, free, scale, own / m + loop.wind_variance, across, cov, walk, known, guess,
+                _posture(
+                    _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known,
+                    0.0, guess,
                 )  # fmt: skip
+                for i in range(3):
+                    state[SHIFT + i] -= guess[i]
+                _learn(
+                    model, k, state[MOTOR : MOTOR + 2], free, scale, own / m + loop.wind_variance, across, cov, walk,
+                    known, guess,
+                )  # fmt: skip
+                # what the model has learned comes off the shift, so that the mirror does not jump
+                _posture(
+                    _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known,
+                    0.0, guess,
+                )  # fmt: skip
+                for i in range(3):
+                    state[SHIFT + i] += guess[i]
                 state[LEARNED] = state[INNOVATION] = state[INNOVATION + 1] = 0.0
-                # what the model has learned comes off the offset, so that the mirror does not jump
-                if _command(model, k, known, row, sun[s - g % loop.interval + loop.interval], counts, work):
-                    for a in range(2):
-                        change = counts[a] - state[NEXT + a]
-                        state[OFFSET + a] -= change / k[13 + a]
-                        state[NEXT + a] += change
-                        state[COMMAND + a] += change
         # motors, gears
         part = (g % loop.interval) / loop.interval
         for a in range(2):
-            want = state[COMMAND + a] + (state[NEXT + a] - state[COMMAND + a]) * part + state[OFFSET + a] * k[13 + a]
+            want = state[COMMAND + a] + (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[13 + a]
             want = min(max(want, k[22 + 2 * a]), k[23 + 2 * a])
             move = 0.0
             if abs(want - state[MOTOR + a]) > loop.dead_band:
@@ -348,13 +400,17 @@ def _track(
             if keeps:
                 trace[i_trace, 0], trace[i_trace, 1], trace[i_trace, 2] = true[0], true[1], true[2]
                 trace[i_trace, 3], trace[i_trace, 4] = state[MOTOR], state[MOTOR + 1]
-                trace[i_trace, 5], trace[i_trace, 6] = state[OFFSET], state[OFFSET + 1]
+                for i in range(3):
+                    trace[i_trace, 5 + i] = state[SHIFT + i]
         # what is measured now
         if not tick or loop.feedback == NO_FEEDBACK:
             continue
         entry = ring[(g // loop.interval) % N_RING]
         entry[0] = 1.0
-        entry[3] = entry[4] = 0.0
+        _posture(
+            _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known, 0.0,
+            guess,
+        )  # fmt: skip
         if loop.feedback == RADIO:
             if g >= loop.settle:
                 total[FRAMES] += 1.0
@@ -364,25 +420,19 @@ def _track(
                 if g >= loop.settle:
                     total[FRAMES_LOST] += 1.0
                 continue
-            drifting = drift * heat[s]
-            right = plate_right + drifting + bias[0] + spread[0] * noise[frame, 0]
-            up = plate_up + bias[1] + spread[1] * noise[frame, 0] + spread[2] * noise[frame, 1]
-            _posture(
-                _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known,
-                0.0, guess,
-            )  # fmt: skip
-            _bisector(row, guess[3:], hoped)
             # measured minus known tilt of the plate is the mirror as the loop sees it
-            for i in range(3):
-                error[i] = hoped[i] - true[i]
-            h = _across(true, error, across)
-            entry[1] = -(across[0] - (right - model[30])) / h
-            entry[2] = across[1] - (up - model[29])
+            right = plate_right + drift * heat[s] + bias[0] + spread[0] * noise[frame, 0] - model[30]
+            up = plate_up + bias[1] + spread[1] * noise[frame, 0] + spread[2] * noise[frame, 1] - model[29]
             for i in range(3):
                 error[i] = true[i] - guess[i]
             _across(true, error, across)
-            entry[3] = across[0] + right - model[30]
-            entry[4] = across[1] + up - model[29]
+            entry[4] = across[0] + right
+            entry[5] = across[1] + up
+            _bisector(row, guess[3:], hoped)
+            for i in range(3):
+                error[i] = hoped[i] - true[i]
+            _across(true, error, across)
+            _along(true, across[0] - right, across[1] - up, entry[1:4])
         elif loop.feedback == ENCODER:
             for a in range(2):
                 here = (axis_1 if a == 0 else axis_2) - p[3 + a]
@@ -391,12 +441,12 @@ def _track(
         else:
             for i in range(3):
                 error[i] = sun[s, i] - true[i]
-            h = _across(true, error, across)
+            _across(true, error, across)
             for a in range(2):
                 seen = across[a] + sensor[a] + drift * heat[s]
                 seen = min(max(seen, -loop.reach), loop.reach * (1.0 - 1e-9))
-                seen = (math.floor(seen / loop.level) + 0.5) * loop.level
-                entry[1 + a] = -seen / h if a == 0 else seen
+                across[a] = (math.floor(seen / loop.level) + 0.5) * loop.level
+            _along(true, across[0], across[1], entry[1:4])
             if not power[s] > 0.0:
                 entry[0] = 0.0
     p[0], p[1] = lean_north, lean_east
@@ -415,7 +465,7 @@ def advance(
     ``target`` (xyz, 1 for a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``noise`` (frame, 2) of variance
     one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step);
     ``power`` (step) [W/m²]; ``drift`` of plate or sensor [rad]; ``trace_error`` (trace); ``stored`` row of ``trace``
-    or −1; ``trace`` (stored, trace, 7).
+    or −1; ``trace`` (stored, trace, 8).
     """
     for h in nb.prange(p.shape[0]):
         keeps = stored[h] >= 0

@@ -98,8 +98,8 @@ def field_positions(scenario: Scenario, count: int | None) -> tuple[tuple[str, .
     return tuple(f"H{k + 1:05d}" for k in range(count)), places
 
 
-def draw_field(scenario: Scenario, *, count: int | None, seed: int, noon_enu: FloatArray) -> Field:
-    """Draw the mirrors of a run; ``noon_enu`` is the sun for which azimuth axes stand in the middle of their travel.
+def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: FloatArray) -> Field:
+    """Draw the mirrors of a run; azimuth axes have the middle of their travel on the sun's course ``sun_enu`` (time, xyz).
 
     Raises
     ------
@@ -113,7 +113,7 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, noon_enu: Fl
     is_dish = plan.collector == "dish"
     if scenario.site.aim_enu_m is None and not is_dish:
         raise ScenarioError("[site] `aim_enu_m` is missing: the mirrors have nothing to face; add it")
-    nominal, constant = _nominal(scenario, ids, pivot, _home_rad(scenario, pivot, noon_enu))
+    nominal, constant = _nominal(scenario, ids, pivot, _home_rad(scenario, pivot, sun_enu))
     true = _true(scenario, nominal, rng)
     lean = 1e-3 * rng.standard_normal((n, 2))
     e = plan.mount_errors
@@ -140,12 +140,18 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, noon_enu: Fl
     )
 
 
-def _home_rad(scenario: Scenario, pivot: FloatArray, noon_enu: FloatArray) -> FloatArray:
-    """Azimuth in the middle of each mirror's travel: of its normal at noon."""
-    normal = np.broadcast_to(noon_enu, pivot.shape)
-    if scenario.tracking.collector == "heliostat":
-        normal = geometry.bisector_enu(np.asarray(scenario.site.aim_enu_m) - pivot, normal)
-    return geometry.azimuth_elevation_from_enu(normal)[0]
+def _home_rad(scenario: Scenario, pivot: FloatArray, sun_enu: FloatArray) -> FloatArray:
+    """Azimuth in the middle of each mirror's travel on that day."""
+    low, high = np.full(len(pivot), np.inf), np.full(len(pivot), -np.inf)
+    azimuth = np.zeros(len(pivot))
+    for i, sun in enumerate(sun_enu):
+        normal = np.broadcast_to(sun, pivot.shape)
+        if scenario.tracking.collector == "heliostat":
+            normal = geometry.bisector_enu(np.asarray(scenario.site.aim_enu_m) - pivot, normal)
+        found = geometry.azimuth_elevation_from_enu(normal)[0]
+        azimuth = found if i == 0 else azimuth + np.mod(found - azimuth + np.pi, 2.0 * np.pi) - np.pi
+        low, high = np.minimum(low, azimuth), np.maximum(high, azimuth)
+    return np.asarray(0.5 * (low + high))
 
 
 def _nominal(

@@ -48,6 +48,7 @@ _PRIORS = {
     "worm_2_cos_rad": (0.0, 1e-3),
 }
 _LARGE = (0.0, 0.03)
+_STEEP = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,7 +256,7 @@ class Workshop:
         return out, np.maximum(errors.sigma_rad / np.sqrt(2.0), 1e-6)
 
     def _scatter_rad(self) -> float:
-        """What a single posture is off for wind, steps and slack, one component [rad]."""
+        """Return what a single posture is off for wind, steps and slack, one component [rad]."""
         drive = self._scenario.tracking.drive
         step = 2.0 * np.pi / drive.steps_per_turn * drive.microsteps / np.sqrt(12.0)
         slack = 1e-3 * float(np.mean(drive.backlash_mrad)) / np.sqrt(12.0)
@@ -293,7 +294,8 @@ class Workshop:
             right_off = np.sum(off * right[:, 0], axis=1) - error[:, 0, 0]
             up_off = np.sum(off * up[:, 0], axis=1) - error[:, 0, 1]
             cosine = np.maximum(np.hypot(wanted[:, 0], wanted[:, 1]), 0.05)
-            turn = np.stack([-right_off / cosine, up_off], axis=1)
+            # near the zenith azimuth says little about where a mirror looks, and would be turned far for it
+            turn = np.stack([np.where(cosine > _STEEP, -right_off / cosine, 0.0), up_off], axis=1)
             distance = np.linalg.norm(target - look.centre_enu_m[:, 0], axis=1)
             far = 2.0 * distance * np.hypot(right_off, up_off) > tolerance_m
             turn = np.rint(turn * per_rad) / per_rad

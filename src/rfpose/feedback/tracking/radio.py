@@ -241,7 +241,7 @@ class RadioModel:
         ]
 
     def _solve(self, rot: FloatArray, *, estimate: bool) -> tuple[FloatArray, FloatArray]:
-        """Normals and rotation covariances of the sampled mirrors by the solver itself."""
+        """Return normals and rotation covariances of the sampled mirrors by the solver itself."""
         sample = self._nearest[0]
         pivot, rot = self._pivot[sample], rot[sample]
         ground = self._scenario.simulation.ground

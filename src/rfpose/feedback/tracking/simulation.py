@@ -68,8 +68,8 @@ class Curves:
         Their errors.
     motor_count : (time, stored, axis)
         Motor positions.
-    offset_rad : (time, stored, axis)
-        What feedback has turned the axes further than the model.
+    shift_enu : (time, stored, xyz)
+        What feedback adds to the normal that the model is asked for.
     """
 
     rms_rad: FloatArray
@@ -78,7 +78,7 @@ class Curves:
     normal_enu: FloatArray
     error_rad: FloatArray
     motor_count: FloatArray
-    offset_rad: FloatArray
+    shift_enu: FloatArray
 
 
 @dataclass(slots=True, kw_only=True)
@@ -146,8 +146,8 @@ class Simulation:
         self.scenario, self.seed = scenario, int(seed)
         self.methods = choose(methods, collector=plan.collector)
         self.days: tuple[Day, ...] = days(scenario)
-        noon = self.days[0].sun_enu[int(np.argmax(self.days[0].sun_enu[:, 2]))]
-        self.field: Field = draw_field(scenario, count=count, seed=self.seed, noon_enu=noon)
+        course = self.days[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
+        self.field: Field = draw_field(scenario, count=count, seed=self.seed, sun_enu=course)
         self.gusts = Gusts(scenario)
         needs_radio = any(m.radio for m in self.methods)
         self.margins: Margins | None = check_gains(scenario) if needs_radio else None
@@ -280,7 +280,7 @@ class Simulation:
             hours=np.zeros((n, 24, 2)),
             histogram=np.zeros((n, _kernels.N_BIN), np.int64),
             curve=np.full((n_time, 3), np.nan),
-            trace=np.full((max(len(self.stored), 1), n_time, 7), np.nan),
+            trace=np.full((max(len(self.stored), 1), n_time, 8), np.nan),
             stored_error=np.full((n_time, len(self.stored)), np.nan),
         )
 
@@ -316,7 +316,7 @@ class Simulation:
         steps = slice(segment.first, segment.end)
         for run in self._runs:
             error = np.full((n, n_stored), np.nan)
-            trace = np.full((max(len(self.stored), 1), n_stored, 7), np.nan)
+            trace = np.full((max(len(self.stored), 1), n_stored, 8), np.nan)
             loop = run.loop
             is_sensor = run.method.feedback == _kernels.SUN_SENSOR
             drift = self._sensor_drift() if is_sensor else self.field.plate_drift_rad
@@ -393,7 +393,7 @@ class Simulation:
             normal_enu=read_only(trace[..., :3]),
             error_rad=read_only(run.stored_error),
             motor_count=read_only(trace[..., 3:5]),
-            offset_rad=read_only(trace[..., 5:7]),
+            shift_enu=read_only(trace[..., 5:8]),
         )
 
     def _run(self, name: str) -> _Run:

@@ -112,8 +112,8 @@ def day_of(scenario: Scenario, date: datetime.date, since_first: int) -> Day:
     if not up.any():
         raise ScenarioError(
             f"[tracking] on {date} the sun is never above {plan.min_sun_elevation_deg:g} degrees between hours "
-            f"{plan.first_hour:g} and {plan.last_hour:g} at latitude {np.rad2deg(site.latitude_rad):.2f}; choose another "
-            "`date`, hours, or a lower `min_sun_elevation_deg`"
+            f"{plan.first_hour:g} and {plan.last_hour:g} at latitude {np.rad2deg(site.latitude_rad):.2f}; choose "
+            "another `date`, hours, or a lower `min_sun_elevation_deg`"
         )
     begin, end = np.ceil(coarse[up][0]), coarse[up][-1]
     lead = max(round(plan.control_interval_s / plan.servo_interval_s), 1) + 1
