@@ -150,8 +150,10 @@ def share_on_receiver(
     sigma = np.hypot(
         distance * np.hypot(field.sun_sigma_rad, 2.0 * field.slope_error_rad), field.mirror_m / np.sqrt(12)
     )
+    # the outline stands upright: a beam that climbs draws its spot out
+    upright = np.hypot(way[:, 0], way[:, 1]) / distance
     half = np.array([receiver.width_m, receiver.height_m]) / 2.0
-    caught = _within(offset, half, sigma[:, None]).prod(axis=1)
+    caught = _within(offset, half, np.stack([sigma, sigma / upright], axis=1)).prod(axis=1)
     cosine = np.clip((normal_enu * sun_enu).sum(axis=1), 0.0, None)
     return np.asarray(np.nan_to_num(caught) * cosine)
 
