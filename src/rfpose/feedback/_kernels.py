@@ -18,7 +18,7 @@ import numpy as np
 
 from rfpose.jit import kernel, kernel_parallel
 
-N_PARAMETER = 31
+N_PARAMETER = 34
 N_CONSTANT = 26
 N_ROW = 10
 _N_PREPARED = 16
@@ -125,6 +125,7 @@ def _residuals(p, k, count, row, use, out):
     prepared = np.empty(_N_PREPARED)
     state = np.empty(6)
     wanted = np.empty(3)
+    seen = np.empty(N_ROW)
     _prepare(p, k, prepared)
     for i in range(len(row)):
         if not use[i]:
@@ -133,7 +134,11 @@ def _residuals(p, k, count, row, use, out):
         azimuth = _axis(0, count[i, 0], p, k, prepared)
         elevation = _axis(1, count[i, 1], p, k, prepared)
         _posture(azimuth, elevation, p, prepared, row[i, 9], state)
-        _bisector(row[i], state[3:], wanted)
+        for j in range(N_ROW):
+            seen[j] = row[i, j]
+        for j in range(3):  # a drone's camera sits beside its antenna
+            seen[j] += seen[3] * p[31 + j]
+        _bisector(seen, state[3:], wanted)
         for j in range(3):
             out[i, j] = (state[j] - wanted[j]) / row[i, 8]
 

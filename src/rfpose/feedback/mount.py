@@ -75,8 +75,13 @@ PARAMETERS: dict[str, float] = {
     "gravity_sag_rad": 1e-3,
     "receiver_plane_up_rad": 1e-3,
     "receiver_plane_right_rad": 1e-3,
+    "drone_camera_east_m": 1e-3,
+    "drone_camera_north_m": 1e-3,
+    "drone_camera_up_m": 1e-3,
 }
-"""Every parameter of a mount, in the kernels' order, with the size of a usual change (it scales the fit)."""
+"""Every parameter of a mount, in the kernels' order, with the size of a usual change (it scales the fit).
+
+The last three belong to the drone that looked at it: its camera less its antenna."""
 
 _NAMES = tuple(PARAMETERS)
 
