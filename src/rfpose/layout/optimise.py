@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
@@ -45,6 +48,8 @@ _WORST_POWER = 12.0
 _BAND = 0.02
 """Width of the ranks that stand for a percentile while searching, so that it has a slope."""
 _FEASIBLE = 1e-6
+_FEW_POINTS = 5000
+"""Field points below which a search keeps to one core."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -284,6 +289,18 @@ def _rows(
     return value, slope
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Search on one core: a few hundred points and tiny matrices, where threads only wait for each other."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        numba.set_num_threads(before)
+
+
 def _statistic(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:
     """Rms, worst or percentile of √variance, and its slope by each variance; smooth stand-ins for the search."""
     n = len(variance)
@@ -396,10 +413,11 @@ def optimise(
     found: list[tuple[float, FloatArray]] = []
     value = np.full(len(begin), np.nan)
     for k, start in enumerate(begin):
-        end = _search(problem, start)
-        if end is not None:
-            value[k] = _value(problem, end)
-            found.append((value[k], end))
+        with _one_thread() if len(field.pivot_enu_m) < _FEW_POINTS else contextlib.nullcontext():
+            end = _search(problem, start)
+            if end is not None:
+                value[k] = _value(problem, end)
+                found.append((value[k], end))
         if progress is not None:
             progress(k + 1, len(begin))
     found = [item for item in found if np.isfinite(item[0])]
