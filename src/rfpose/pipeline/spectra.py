@@ -146,10 +146,20 @@ class PhaseTrack:
 
     def difference(
         self, transmitter: int, reference: int, tone: int, *, corrected: bool
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return one transmitter's phase less another's over frames and its sigma (frame,), without jumps of 2π.
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Return one transmitter's phase less another's over frames.
 
-        ``corrected``: less the difference of the transmitters' own phases.
+        Parameters
+        ----------
+        corrected
+            Take the difference of the transmitters' own phases off.
+
+        Returns
+        -------
+        mean_rad
+            Mean direction, in (−π, π]; NaN where nothing was measured.
+        offset_rad, sigma_rad : (frame,)
+            From the mean, in (−π, π], and its standard deviation [rad].
         """
         pair = np.array([transmitter, reference])
         phase, sigma = self.phase_rad[:, pair, tone], self.sigma_rad[:, pair, tone]
@@ -158,10 +168,8 @@ class PhaseTrack:
             sigma = np.hypot(sigma, self.electronic_sigma_rad[:, pair, tone])
         step = phase[:, 0] - phase[:, 1]
         seen = np.isfinite(step)
-        if seen.any():
-            middle = float(np.angle(np.mean(np.exp(1j * step[seen]))))
-            step = middle + wrap(step - middle)
-        return step, np.hypot(sigma[:, 0], sigma[:, 1])
+        mean = float(np.angle(np.mean(np.exp(1j * step[seen])))) if seen.any() else float("nan")
+        return mean, wrap(step - mean), np.hypot(sigma[:, 0], sigma[:, 1])
 
 
 class SharedRecording(Recording):

@@ -57,6 +57,11 @@ def check_installed() -> None:
     missing = [name for name in ("PySide6", "pyqtgraph") if importlib.util.find_spec(name) is None]
     if missing:
         raise RfposeError(f"the viewer needs {' and '.join(missing)}; install the extra: pip install 'rfpose[gui]'")
+    import PySide6
+
+    if sys.version_info < (3, 12) and PySide6.__version__.startswith("6.12.0"):
+        # built for interpreters whose None is never counted: an older one dies after some thousand calls
+        raise RfposeError("PySide6 6.12.0 crashes Python 3.11; install another: pip install 'PySide6-Essentials<6.12'")
     try:
         from PySide6 import QtSvg, QtWidgets  # noqa: F401
     except ImportError as error:
@@ -129,7 +134,13 @@ def make_application(*, offscreen: bool = False) -> QApplication:
     return app
 
 
-def run(path: Path | None = None, *, scenario_path: Path | None = None, theme: str | None = None) -> int:
+def run(
+    path: Path | None = None,
+    *,
+    scenario_path: Path | None = None,
+    theme: str | None = None,
+    size: tuple[int, int] | None = None,
+) -> int:
     """Open the window and return its exit code when it is closed.
 
     Raises
@@ -149,6 +160,8 @@ def run(path: Path | None = None, *, scenario_path: Path | None = None, theme: s
     if theme is not None:
         preferences.save(replace(preferences.load(), theme=theme))
     window = MainWindow(preferences)
+    if size is not None and preferences.geometry() is None:
+        window.resize(*size)
     window.show()
     if path is not None:
         window.open_path(path, scenario_path=scenario_path)

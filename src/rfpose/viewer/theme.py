@@ -49,8 +49,8 @@ _LIGHT = Theme(
 )
 _DARK = Theme(
     name="dark",
-    window="#1f2328",
-    base="#15181c",
+    window="#22272d",
+    base="#323941",
     plot="#15181c",
     text="#e6e9ed",
     muted="#9aa4af",

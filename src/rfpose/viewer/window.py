@@ -160,7 +160,7 @@ class MainWindow(QMainWindow):
         self._busy_timer.timeout.connect(self._show_busy)
 
     def _build_menu(self) -> None:
-        def action(menu: str, text: str, keys: str, slot: Callable[[], None]) -> QAction:
+        def action(menu: str, text: str, keys: str, slot: Callable[[], object]) -> QAction:
             item = QAction(text, self)
             if keys:
                 item.setShortcut(QKeySequence(keys))
@@ -179,7 +179,7 @@ class MainWindow(QMainWindow):
         action("File", "Save layout as scenario…", "Ctrl+S", self._ask_layout)
         menus["File"].addSeparator()
         action("File", "Close file", "Ctrl+W", self.close_document)
-        action("File", "Quit", "Ctrl+Q", lambda: self.close() and None)
+        action("File", "Quit", "Ctrl+Q", self.close)
         action("Edit", "Undo", "Ctrl+Z", lambda: self._layout().undo())
         action("Edit", "Redo", "Ctrl+Shift+Z", lambda: self._layout().redo())
         action("Edit", "Add transmitter", "A", lambda: self._in_layout(self._layout().add))

@@ -117,7 +117,7 @@ class FieldView(View):
         self.headline = QLabel("Click a mirror to see its poses.")
         self.headline.setWordWrap(True)
         graphs = pg.GraphicsLayoutWidget()
-        self.offset_plot = plot_in(graphs, theme, x="time [s]", y="offset [mrad]")
+        self.offset_plot = plot_in(graphs, theme, x="time [s]", y=None)
         self.offset_plot.addLegend(offset=(-4, 4), labelTextSize="8pt", colCount=2)
         self.offset_curves = [
             self.offset_plot.plot(
@@ -130,7 +130,14 @@ class FieldView(View):
             self.offset_plot.plot([], [], pen=pg.mkPen(theme.muted, width=1, style=Qt.PenStyle.DashLine))
             for _ in range(2)
         ]
-        self.ellipse_plot = plot_in(graphs, theme, x="across [mrad]", y="up [mrad]", column=1)
+        self.ellipse_plot = plot_in(graphs, theme, x=None, y=None, column=1)
+        for plot, side, text in (
+            (self.offset_plot, "left", "offset"),
+            (self.ellipse_plot, "bottom", "across"),
+            (self.ellipse_plot, "left", "up"),
+        ):
+            plot.setLabel(side, text, units="rad")
+            plot.getAxis(side).enableAutoSIPrefix(True)
         self.ellipse_plot.setAspectLocked(True)
         self.ellipses = pg.PlotCurveItem(pen=pg.mkPen(theme.muted, width=1), connect="finite")
         self.ellipse_now = pg.PlotCurveItem(pen=pg.mkPen(SERIES[1], width=2))
@@ -331,16 +338,16 @@ class FieldView(View):
             f"Below: {what}, 95 % ellipse."
         )
         for k, curve in enumerate(self.offset_curves):
-            curve.setData(found.time_s, found.offset_mrad[:, k])
+            curve.setData(found.time_s, 1e-3 * found.offset_mrad[:, k])
         known = np.isfinite(found.sigma_mrad)
         for sign, line in zip((1.0, -1.0), self.band, strict=True):
-            line.setData(found.time_s[known], sign * found.sigma_mrad[known])
-        outline = np.concatenate([found.ellipse_mrad, np.full((len(found.ellipse_mrad), 1, 2), np.nan)], axis=1)
+            line.setData(found.time_s[known], 1e-3 * sign * found.sigma_mrad[known])
+        outline = 1e-3 * np.concatenate([found.ellipse_mrad, np.full((len(found.ellipse_mrad), 1, 2), np.nan)], axis=1)
         self.ellipses.setData(outline[..., 0].ravel(), outline[..., 1].ravel())
         seen = np.isfinite(found.offset_mrad).all(axis=1)
-        self.ellipse_dots.setData(found.offset_mrad[seen, 0], found.offset_mrad[seen, 1])
+        self.ellipse_dots.setData(1e-3 * found.offset_mrad[seen, 0], 1e-3 * found.offset_mrad[seen, 1])
         if np.isfinite(found.ellipse_mrad[frame]).all():
-            self.ellipse_now.setData(found.ellipse_mrad[frame, :, 0], found.ellipse_mrad[frame, :, 1])
+            self.ellipse_now.setData(1e-3 * found.ellipse_mrad[frame, :, 0], 1e-3 * found.ellipse_mrad[frame, :, 1])
         for plot in (self.offset_plot, self.ellipse_plot):
             plot.vb.autoRange(padding=0.1)
         self._draw_residuals(document.field, found, frame)

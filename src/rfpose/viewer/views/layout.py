@@ -120,6 +120,7 @@ class LayoutView(View):
         scroll = QScrollArea()
         scroll.setWidget(panel)
         scroll.setWidgetResizable(True)
+        scroll.setMinimumWidth(panel.minimumSizeHint().width() + 24)
         scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         split = QSplitter(Qt.Orientation.Horizontal)
         split.addWidget(self.graphs)
@@ -140,13 +141,15 @@ class LayoutView(View):
         grid.addWidget(self.lock, 0, 2)
         self.place: list[QDoubleSpinBox] = []
         for k, text in enumerate(("east", "north", "height")):
-            spin = QDoubleSpinBox(decimals=2, minimum=-1e6, maximum=1e6, suffix=" m", keyboardTracking=False)
+            spin = QDoubleSpinBox(decimals=2, minimum=-1e5, maximum=1e5, suffix=" m")
+            spin.setKeyboardTracking(False)
             spin.setToolTip(f"{text} in the site frame [m]")
             spin.valueChanged.connect(lambda value, k=k: self._typed(k, value))
             grid.addWidget(QLabel(text), 1, k)
             grid.addWidget(spin, 2, k)
             self.place.append(spin)
-        self.height_slider = QSlider(Qt.Orientation.Horizontal, minimum=0, maximum=_HEIGHT_STEPS)
+        self.height_slider = QSlider(Qt.Orientation.Horizontal)
+        self.height_slider.setRange(0, _HEIGHT_STEPS)
         self.height_slider.setToolTip("Height of the antenna in the site frame")
         self.height_slider.sliderPressed.connect(self._slider_pressed)
         self.height_slider.sliderReleased.connect(self._slider_released)
@@ -184,14 +187,15 @@ class LayoutView(View):
             self.posture.addItem(text, key)
         self.posture.activated.connect(lambda _: self._choose(posture=self.posture.currentData()))
         form.addRow("Posture", self.posture)
-        self.sun_azimuth = QDoubleSpinBox(minimum=0.0, maximum=360.0, suffix="°", decimals=1, keyboardTracking=False)
-        self.sun_elevation = QDoubleSpinBox(minimum=0.1, maximum=90.0, suffix="°", decimals=1, keyboardTracking=False)
+        self.sun_azimuth = QDoubleSpinBox(minimum=0.0, maximum=360.0, suffix="°", decimals=1)
+        self.sun_elevation = QDoubleSpinBox(minimum=0.1, maximum=90.0, suffix="°", decimals=1)
         for spin in (self.sun_azimuth, self.sun_elevation):
+            spin.setKeyboardTracking(False)
             spin.valueChanged.connect(lambda _: self._sun_typed())
         row = QHBoxLayout()
-        row.addWidget(QLabel("az."))
+        self.sun_azimuth.setPrefix("az. ")
+        self.sun_elevation.setPrefix("el. ")
         row.addWidget(self.sun_azimuth)
-        row.addWidget(QLabel("el."))
         row.addWidget(self.sun_elevation)
         form.addRow("Sun", row)
         self.moment = QDateTimeEdit()
@@ -202,8 +206,9 @@ class LayoutView(View):
         form.addRow("Time of day", self.moment)
         self.costs: list[QDoubleSpinBox] = []
         row = QHBoxLayout()
-        for text, value in (("tower", 1.0), ("m up", 0.0), ("m cable", 0.0)):
-            spin = QDoubleSpinBox(decimals=2, maximum=1e9, value=value, keyboardTracking=False)
+        for text, value in (("tower", 1.0), ("m height", 0.0), ("m cable", 0.0)):
+            spin = QDoubleSpinBox(decimals=2, maximum=1e6, value=value)
+            spin.setKeyboardTracking(False)
             spin.setToolTip(f"Cost per {text}")
             spin.valueChanged.connect(lambda _: self._costs_typed())
             part = QVBoxLayout()
@@ -236,7 +241,7 @@ class LayoutView(View):
             grid.addWidget(QLabel(text), 2 * (k // 2), k % 2)
             grid.addWidget(widget, 2 * (k // 2) + 1, k % 2)
         self.progress = QProgressBar()
-        self.progress.setFormat("%v of %m starts")
+        self.progress.setFormat("")
         self.progress.setValue(0)
         self.run_button = QPushButton("Optimise")
         self.run_button.setToolTip("Locked transmitters stay; the others stay within the circle and heights of all")
@@ -281,7 +286,9 @@ class LayoutView(View):
         ]
         self._fill_choice(self._edit)
         self._show_handles()
-        self.choose(self._edit.ids[0] if self._edit.ids else None)
+        self.chosen = self._edit.ids[0] if self._edit.ids else None
+        self._place_handles()
+        self._show_chosen()
         self._show_all()
         self._prepare()
 
@@ -647,6 +654,7 @@ class LayoutView(View):
             self._optimised,
             failed=self._search_failed,
         )
+        self.progress.setFormat("%v of %m starts")
         self.progress.setMaximum(starts + 1)
         job.progressed.connect(lambda done, total: self._search_progress(done, total))
 

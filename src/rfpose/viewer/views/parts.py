@@ -59,7 +59,9 @@ class View(QWidget):
         return self.session.document is not None
 
 
-def plot_in(layout: Any, theme: Theme, *, x: str, y: str, row: int = 0, column: int = 0, **options: Any) -> Any:
+def plot_in(
+    layout: Any, theme: Theme, *, x: str | None, y: str | None, row: int = 0, column: int = 0, **options: Any
+) -> Any:
     """Add a plot to a graphics layout, with what its axes show and in which unit."""
     plot = layout.addPlot(row=row, col=column, **options)
     plot.setLabel("bottom", x)
@@ -232,6 +234,7 @@ class Plan:
 
     def _label(self, name: str, place: FloatArray, colour: str) -> None:
         label = pg.TextItem(name, color=colour, anchor=(-0.15, 1.05))
+        label.setZValue(20)
         label.setPos(float(place[0]), float(place[1]))
         self.plot.addItem(label, ignoreBounds=True)
         self.labels.append(label)

@@ -61,9 +61,9 @@ class RecordingView(View):
         self.track: PhaseTrack | None = None
         self._summary: dict[str, Any] | None = None
         self._marks: list[Any] = []
-        self._build()
         self._refine = QTimer(self, singleShot=True, interval=_REDRAW_MS)
         self._refine.timeout.connect(self._refine_waterfall)
+        self._build()
         self.listen(session.opened, self._on_opened)
         self.listen(session.selected, self._on_selected)
         self._on_opened()
@@ -108,15 +108,15 @@ class RecordingView(View):
                 bar.addWidget(QLabel(text))
             bar.addWidget(widget, 1 if widget is self.frame else 0)
         self._build_plots()
-        self.lines = Table(("transmitter", "carrier [dBFS]", "carrier SNR [dB]", "tone sigma [mrad]", "status"))
-        self.lines.itemSelectionChanged.connect(self._line_chosen)
-        self.receivers = Table(("receiver", "level [dBFS]", "clipped", "gaps", "lost samples", "blocks"))
-        self.receivers.itemSelectionChanged.connect(self._receiver_chosen)
+        self.line_table = Table(("", "carrier\n[dBFS]", "carrier\nSNR [dB]", "tone σ\n[mrad]", "status"))
+        self.line_table.itemSelectionChanged.connect(self._line_chosen)
+        self.receiver_table = Table(("", "level\n[dBFS]", "clipped", "gaps", "samples\nlost", "blocks"))
+        self.receiver_table.itemSelectionChanged.connect(self._receiver_chosen)
         self.frame_facts = QLabel()
         self.frame_facts.setWordWrap(True)
         self.tables = QTabWidget()
-        self.tables.addTab(self.lines, "Transmitters")
-        self.tables.addTab(self.receivers, "Receivers")
+        self.tables.addTab(self.line_table, "Transmitters")
+        self.tables.addTab(self.receiver_table, "Receivers")
         right = QSplitter(Qt.Orientation.Vertical)
         right.addWidget(self.side)
         below = QWidget()
@@ -145,9 +145,6 @@ class RecordingView(View):
         for item, text in ((self.carriers, "carrier"), (self.sidebands, "sideband")):
             self.spectrum_plot.addItem(item)
             item.setToolTip(text)
-        legend = self.spectrum_plot.addLegend(offset=(-8, 4), labelTextSize="8pt")
-        legend.addItem(self.carriers, "carrier")
-        legend.addItem(self.sidebands, "sideband of a tone")
         self.chosen_line = pg.InfiniteLine(angle=90, pen=pg.mkPen("#E69F00", width=2))
         self.chosen_line.setVisible(False)
         self.spectrum_plot.addItem(self.chosen_line, ignoreBounds=True)
@@ -160,9 +157,9 @@ class RecordingView(View):
         self.waterfall_plot.sigRangeChanged.connect(lambda *_: self._refine.start())
         self.frame_line = pg.InfiniteLine(angle=0, pen=pg.mkPen("#E69F00", width=1.5))
         self.waterfall_plot.addItem(self.frame_line, ignoreBounds=True)
-        self.phase_plot = plot_in(
-            self.graphs, theme, x="time from the first sample [s]", y="phase difference [rad]", row=2
-        )
+        self.phase_plot = plot_in(self.graphs, theme, x="time from the first sample [s]", y=None, row=2)
+        self.phase_plot.setLabel("left", "phase difference from its mean", units="rad")
+        self.phase_plot.getAxis("left").enableAutoSIPrefix(True)
         self.phase_bars = pg.ErrorBarItem(x=np.empty(0), y=np.empty(0), height=np.empty(0), beam=0.0)
         self.phase_curve = pg.PlotDataItem(pen=pg.mkPen(SERIES[0], width=1.5), symbol="o", symbolSize=6, symbolPen=None)
         self.phase_curve.setSymbolBrush(SERIES[0])
@@ -195,9 +192,10 @@ class RecordingView(View):
         if field is not None:
             n = len(field.pivot_enu_m)
             grey = [pg.mkColor(self.theme.muted)]
-            self.plan.dots.set_data(*field.pivot_enu_m[:, :2].T, np.zeros(n, np.int64), grey, 6.0)
-        self.lines.fill([])
-        self.receivers.fill([])
+            east, north = field.pivot_enu_m[:, 0], field.pivot_enu_m[:, 1]
+            self.plan.dots.set_data(east, north, np.zeros(n, np.int64), grey, 6.0)
+        self.line_table.fill([])
+        self.receiver_table.fill([])
         self._draw_spectrum()
         self._draw_waterfall()
         self._draw_look()
@@ -209,7 +207,7 @@ class RecordingView(View):
             rate_hz = float(document.recording.sample_rate)
             self.spectrum_plot.setXRange(-0.5e-6 * rate_hz, 0.5e-6 * rate_hz, padding=0.01)
             self.waterfall_plot.setYRange(0.0, float(len(starts)), padding=0.0)
-            self._refine.stop()
+            self._refine.start()
             self._load_levels(document)
         self._load_frame()
         self._load_receiver()
@@ -257,7 +255,7 @@ class RecordingView(View):
             return
         if now.receiver is not None:
             self.receiver.setCurrentText(now.receiver)
-            self.receivers.choose(self.receiver.currentIndex())
+            self.receiver_table.choose(self.receiver.currentIndex())
         for box, index in ((self.transmitter, now.transmitter), (self.reference, now.reference), (self.tone, now.tone)):
             box.setCurrentIndex(-1 if index is None else index)
         self.frame.blockSignals(True)
@@ -267,7 +265,7 @@ class RecordingView(View):
         self.frame_line.setPos(now.frame + 0.5)
         if document.field is not None:
             self.plan.light_up(document.field, now.transmitter)
-        self.lines.choose(now.transmitter)
+        self.line_table.choose(now.transmitter)
         self.chosen_line.setVisible(now.transmitter is not None and document.scenario is not None)
         if now.transmitter is not None and document.scenario is not None:
             self.chosen_line.setPos(1e-6 * float(document.scenario.carrier_hz[now.transmitter]))
@@ -286,11 +284,11 @@ class RecordingView(View):
             self.session.select(transmitter=nearest)
 
     def _line_chosen(self) -> None:
-        if self.lines.currentRow() >= 0:
-            self.session.select(transmitter=self.lines.currentRow())
+        if self.line_table.currentRow() >= 0:
+            self.session.select(transmitter=self.line_table.currentRow())
 
     def _receiver_chosen(self) -> None:
-        row = self.receivers.currentRow()
+        row = self.receiver_table.currentRow()
         if row >= 0 and self.receiver.itemText(row):
             self.session.select(receiver=self.receiver.itemText(row))
 
@@ -393,7 +391,11 @@ class RecordingView(View):
                 item.setData([], [])
             self.spectrum_plot.setTitle("no samples in this frame" if self._has_frames() else None)
             return
-        self.spectrum_plot.setTitle(None)
+        key = "&nbsp;&nbsp;".join(
+            f'<span style="color:{colour}">{text}</span>'
+            for colour, text in ((SERIES[0], "▼ carrier"), (SERIES[1], "● sideband"))
+        )
+        self.spectrum_plot.setTitle(key if found.line_hz.size else None, size="9pt", color=self.theme.muted)
         self.spectrum_plot.setLabel("left", "power [dBFS]" if found.full_scale else "power [dB of one count²]")
         self.spectrum_curve.setData(1e-6 * found.frequency_hz, found.power_db)
         top = float(found.power_db.max())
@@ -448,11 +450,11 @@ class RecordingView(View):
         self.circle_plot.setTitle("analytic tone", size="9pt", color=self.theme.muted)
         if self.look is None or document is None or document.scenario is None or document.recording is None:
             self.frame_facts.setText("")
-            self.lines.fill([])
+            self.line_table.fill([])
             return
         tones, scenario = self.look.tones, document.scenario
         rows = line_health(tones, scenario.transmitter_ids, document.recording.full_scale)
-        self.lines.fill(
+        self.line_table.fill(
             [
                 [
                     row.transmitter_id,
@@ -464,7 +466,7 @@ class RecordingView(View):
                 for row in rows
             ]
         )
-        self.lines.choose(now.transmitter)
+        self.line_table.choose(now.transmitter)
         clock = (
             f"clock {tones.clock_ppm:+.4f} ± {tones.clock_sigma_ppm:.2g} ppm"
             if np.isfinite(tones.clock_ppm)
@@ -498,7 +500,7 @@ class RecordingView(View):
         if transmitter == now.reference and len(document.scenario.transmitter) > 1:
             transmitter = 1 if now.reference == 0 else 0
         corrected = self.corrected.isChecked() and self.corrected.isEnabled()
-        phase, sigma = self.track.difference(transmitter, now.reference, now.tone, corrected=corrected)
+        mean, phase, sigma = self.track.difference(transmitter, now.reference, now.tone, corrected=corrected)
         names = document.scenario.transmitter_ids
         known = np.isfinite(phase)
         x = self.track.time_s
@@ -514,7 +516,9 @@ class RecordingView(View):
         lost = f", {int((~known).sum())} of {len(phase)} frames not measured" if not known.all() else ""
         worst = f", σ up to {1e3 * float(np.nanmax(sigma)):.3g} mrad" if np.isfinite(sigma).any() else ""
         self.phase_plot.setTitle(
-            f"{names[transmitter]} − {names[now.reference]}, {how}{worst}{lost}", size="9pt", color=self.theme.muted
+            f"{names[transmitter]} − {names[now.reference]}, {how}: mean {mean:.5f} rad{worst}{lost}",
+            size="9pt",
+            color=self.theme.muted,
         )
 
     def _show_levels(self, summary: dict[str, Any]) -> None:
@@ -542,7 +546,7 @@ class RecordingView(View):
                     str(entry.get("blocks", 0)),
                 ]
             )
-        self.receivers.fill(rows)
+        self.receiver_table.fill(rows)
         if summary["problems"] and self.session.message is None:
             more = f" (and {len(summary['problems']) - 1} more)" if len(summary["problems"]) > 1 else ""
             self.session.tell(f"{summary['problems'][0]}{more}")

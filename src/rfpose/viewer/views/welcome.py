@@ -45,12 +45,12 @@ class Welcome(QWidget):
         )
         kinds.setWordWrap(True)
         buttons = QHBoxLayout()
-        for text, action in (
+        for label, action in (
             ("Open a file…  (Ctrl+O)", open_file),
             ("Open a directory…  (Ctrl+Shift+O)", open_directory),
             ("Open the example site  (Ctrl+E)", open_example),
         ):
-            button = QPushButton(text)
+            button = QPushButton(label)
             button.setMinimumHeight(34)
             button.clicked.connect(lambda _=False, action=action: action())
             buttons.addWidget(button)
@@ -65,8 +65,8 @@ class Welcome(QWidget):
         inner = QWidget()
         inner.setMaximumWidth(900)
         column = QVBoxLayout(inner)
-        for widget in (title, version, kinds):
-            column.addWidget(widget)
+        for text in (title, version, kinds):
+            column.addWidget(text)
         column.addLayout(buttons)
         column.addSpacing(12)
         for widget in (self.recent_label, self.recent, hint):
