@@ -108,7 +108,7 @@ def test_covariance_with_estimated_coefficient_is_that_of_one_large_matrix():
     assert np.all(state.chi2 < 1e-6)
     reflection = np.linalg.inv(state.schur.sum(axis=0))
     follow = state.follow[:, :6]
-    stated = state.cov + follow @ reflection @ np.swapaxes(follow, 1, 2)
+    stated = state.cov[:, :6, :6] + follow @ reflection @ np.swapaxes(follow, 1, 2)
 
     n_mirror, n_group, n_receiver, n_transmitter = predicted.shape
     own = 6 + 2 * n_receiver + n_group * n_transmitter

@@ -65,6 +65,12 @@ def show_evaluation(evaluation: Evaluation, *, title: str) -> None:
     ]
     table(title, ["error", "rms", "median", "worst", "bound"], rows)
     say(f"rms over bound: {evaluation.ratio_to_bound:.3f} (bound from the {evaluation.bound_source}'s noise)")
+    protection = evaluation.protection
+    if protection is not None:
+        say(
+            f"protection level: median {protection.level_mrad.median:.3g} mrad of the normal; exceeded in "
+            f"{protection.exceeded} of {protection.covered}, {protection.excluded} transmitters left out"
+        )
     say(f"mirror-frames: {evaluation.solved} solved, {evaluation.failed} failed")
     for reason, count in evaluation.failure_reasons.items():
         say(f"  {count}: {reason}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -18,11 +19,12 @@ from rfpose.cli._support import (
     wants_json,
 )
 
-__all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "command"]
+__all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "REFLECTION_NAMES", "command"]
 
-# Written out so that --help need not load the signal processing; a test holds them to rfpose.dsp.
+# Written out so that --help need not load the signal processing; a test holds them to what they name.
 ESTIMATOR_NAMES = ("hilbert", "correlator", "dot", "dot-compensated")
 POSE_NAMES = ("rigid", "independent")
+REFLECTION_NAMES = ("estimate", "ignore")
 
 
 @click.command(
@@ -31,6 +33,7 @@ POSE_NAMES = ("rigid", "independent")
         "rfpose process recording.h5 -o result.h5",
         "rfpose process recording.h5 -o result.h5 --csv poses.csv --estimator correlator",
         "rfpose process measured/drf --scenario site.toml -o result.h5",
+        "rfpose process recording.h5 -o result.h5 --reflection estimate",
     ),
 )
 @click.argument("recording", type=click.Path(path_type=Path))
@@ -51,6 +54,18 @@ POSE_NAMES = ("rigid", "independent")
     help="How a mirror's normal follows: from all phases of its receivers at once, or from each receiver located on "
     "its own, as published.",
 )
+@click.option(
+    "--reflection",
+    type=click.Choice(REFLECTION_NAMES),
+    help="Estimate the ground's reflection with the poses, or leave reflections out of the model. "
+    "[default: as the scenario's [reflection] says]",
+)
+@click.option(
+    "--integrity/--no-integrity",
+    default=None,
+    help="Test residuals, leave bad transmitters out, give protection levels. "
+    "[default: as the scenario's [integrity] says: on]",
+)
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @force_option
 @common_options
@@ -62,6 +77,8 @@ def command(
     scenario: Path | None,
     estimator: str,
     pose: str,
+    reflection: str | None,
+    integrity: bool | None,
     csv_path: Path | None,
     force: bool,
 ) -> None:
@@ -85,6 +102,8 @@ def command(
             scenario_path=scenario,
             estimator=estimator,
             pose=pose,
+            reflection=reflection,
+            integrity=integrity,
             force=force,
             on_progress=on_progress,
         )
@@ -105,3 +124,24 @@ def command(
     for what in ("poses", "fixes", "tones"):
         for reason, count in summary[what]["reasons"].items():
             say(f"  {count} {what}: {reason}")
+    for line in _findings(summary):
+        say(f"  {line}")
+
+
+def _findings(summary: dict[str, Any]) -> list[str]:
+    """Put what the estimator of poses found besides poses into words."""
+    out = []
+    integrity = summary.get("integrity", {})
+    for reason, count in integrity.get("reasons", {}).items():
+        out.append(f"{count} mirror-frames {reason}")
+    for name, reasons in integrity.get("excluded", {}).items():
+        out.extend(f"transmitter {name} left out of {count}: {reason}" for reason, count in reasons.items())
+    if integrity.get("protection_level_mrad") is not None:
+        out.append(f"protection level, median: {integrity['protection_level_mrad']:.3g} mrad of the normal")
+    for name, c in summary.get("reflection", {}).get("coefficients", {}).items():
+        value = "" if c["real"] is None else f": {c['real']:+.4f} {c['imag']:+.4f}j, sigma {c['sigma']:.2g}"
+        out.append(f"reflection of {name} {c['status']}{value}")
+    delays = summary.get("delays", {})
+    if delays.get("last_sigma_ps") is not None:
+        out.append(f"receiver delays learned to {delays['last_sigma_ps']:.3g} ps, {delays['jumps']} jumps")
+    return out

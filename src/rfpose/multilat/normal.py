@@ -30,6 +30,9 @@ class PoseStatus(IntEnum):
     RESIDUAL = 3
     UNDETERMINED = 4
     NOT_CONVERGED = 5
+    UNEXPLAINED = 6
+    BEHIND_REFLECTOR = 7
+    UNKNOWNS = 8
 
     @property
     def reason(self) -> str:
@@ -44,6 +47,11 @@ _REASON = {
     PoseStatus.RESIDUAL: "solved, but a receiver's residuals are far above what the sigma of the ranges allows",
     PoseStatus.UNDETERMINED: "the measurements leave part of the pose open; more transmitters or a surveyed pivot help",
     PoseStatus.NOT_CONVERGED: "the pose did not converge",
+    PoseStatus.UNEXPLAINED: "solved, but residuals are larger than noise and a few bad transmitters explain: a reflection "
+    "that is not in the model?",
+    PoseStatus.BEHIND_REFLECTOR: "a receiver lies behind a reflecting plane (below the ground)",
+    PoseStatus.UNKNOWNS: "fewer measurements than unknowns: more transmitters received, a surveyed pivot, a mount or "
+    "known delays would help",
 }
 
 

@@ -12,18 +12,20 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.dsp.bounds import phase_bound_rad
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.geometry import angle_between_rad, unit
-from rfpose.multilat import FixStatus, PoseStatus, normal_bound, position_bound
+from rfpose.multilat import FixStatus, PoseStatus, position_bound
+from rfpose.multilat.integrity import TransmitterStatus
+from rfpose.pipeline.bound import normal_bound_rad
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.result_file import Result, count_reasons, is_result, read_result
-from rfpose.pipeline.rigid import rigid_normal_bound
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
-__all__ = ["Evaluation", "HeliostatRow", "Statistics", "evaluate", "read_truth"]
+__all__ = ["Evaluation", "HeliostatRow", "Protection", "Statistics", "evaluate", "read_truth"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,6 +69,36 @@ class HeliostatRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Protection:
+    """How protection levels held, over solved mirror-frames.
+
+    Attributes
+    ----------
+    level_mrad
+        The levels themselves [mrad of the normal].
+    covered, exceeded
+        Mirror-frames with a finite level, and those among them whose error is larger.
+    excluded
+        Transmitters left out, one a mirror-frame.
+    """
+
+    level_mrad: Statistics
+    covered: int
+    exceeded: int
+    excluded: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what ``rfpose evaluate --json`` prints."""
+        return {
+            "level_mrad": self.level_mrad.as_dict(),
+            "covered": self.covered,
+            "exceeded": self.exceeded,
+            "exceeded_fraction": self.exceeded / self.covered if self.covered else None,
+            "excluded": self.excluded,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
     """Errors of a result against the truth; a milliradian here is of the mirror normal.
 
@@ -90,6 +122,8 @@ class Evaluation:
         Mirror-frames by reason.
     heliostats
         One row each.
+    protection
+        How protection levels held; None where the result has none.
     normal_error_rad, bound_rad : (frame, heliostat)
         What the figures were made of; NaN where not solved or not known.
     """
@@ -107,6 +141,7 @@ class Evaluation:
     heliostats: tuple[HeliostatRow, ...]
     normal_error_rad: FloatArray
     bound_rad: FloatArray
+    protection: Protection | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``rfpose evaluate --json`` prints; its keys are a contract."""
@@ -121,6 +156,7 @@ class Evaluation:
             "solved": self.solved,
             "failed": self.failed,
             "failure_reasons": dict(self.failure_reasons),
+            "protection": None if self.protection is None else self.protection.as_dict(),
             "heliostats": [
                 {
                     "id": row.id,
@@ -229,13 +265,21 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
     located = (result.fixes.status == FixStatus.OK) & is_mirror
     normal_error = np.where(solved, angle_between_rad(result.poses.normal_enu, normal_true), np.nan)
     position_error = np.where(located, np.linalg.norm(result.fixes.position_enu_m - receiver_true, axis=-1), np.nan)
-    own_m, calibration_m, source = _noise(result, truth, rows)
-    if result.settings.get("pose") == "rigid":
-        bound = rigid_normal_bound(result, truth, rows, normal_true)
-    else:
-        bound = _normal_bound(result.scenario, receiver_true, own_m, calibration_m)
+    choice = PoseChoice.of(result.settings, result.scenario)
+    # fading changes the power of each tone, which the truth's ratios (of direct rays) do not know
+    noise = phase_noise(result, truth, rows, reported=choice.reflection != "none")
+    bound = normal_bound_rad(
+        result.scenario,
+        choice,
+        noise,
+        normal_enu=normal_true,
+        receiver_enu_m=receiver_true,
+        frame_start_index=result.frame_start_index,
+        sample_rate=result.sample_rate,
+        coefficient=_true_coefficient(result),
+    )
     bound = np.where(np.isfinite(normal_error), bound, np.nan)
-    total_m = np.hypot(own_m, calibration_m)
+    total_m = np.hypot(noise.own_m, noise.calibration_m)
     position_cov = position_bound(result.scenario.transmitter_enu_m, receiver_true, total_m)
     bound_m = np.where(np.isfinite(position_error), np.sqrt(np.trace(position_cov, axis1=-2, axis2=-1)), np.nan)
     sigma = np.where(solved, result.poses.sigma_rad, np.nan)
@@ -247,7 +291,7 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
         position_error_m=Statistics.of(position_error),
         bound_mrad=1e3 * _rms(bound),
         bound_m=_rms(bound_m),
-        bound_source=source,
+        bound_source=noise.source,
         ratio_to_bound=ratio,
         sigma_mrad=1e3 * _rms(sigma),
         solved=int(np.count_nonzero(solved)),
@@ -266,6 +310,7 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
         ),
         normal_error_rad=normal_error,
         bound_rad=bound,
+        protection=_protection(result, normal_error),
     )
 
 
@@ -280,42 +325,28 @@ def _of_frames(array: FloatArray, rows: npt.NDArray[np.int64]) -> FloatArray:
     return picked
 
 
-def _noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray, str]:
-    """Return range noise of receivers and of calibration (frame, receiver, transmitter) [m], and where it is from."""
-    if truth.tone_snr is None:
-        return result.ranges.sigma_m, result.ranges.calibration_sigma_m, "result"
-    scenario = result.scenario
-    snr = _of_frames(truth.tone_snr, rows)
-    with np.errstate(invalid="ignore"):
-        snr = np.where(snr > 0.0, snr, np.nan)
-        phase = phase_bound_rad(scenario.radio.frame_samples, snr)
-    own_m = _combine(phase * scenario.wavelength_m / (2.0 * np.pi))
-    is_calibration = np.array([row.calibration is not None for row in scenario.receivers], bool)
-    calibration_m = _combine(np.moveaxis(own_m[:, is_calibration], 1, -1))
-    return own_m, np.broadcast_to(calibration_m[:, None], own_m.shape), "truth"
+def _true_coefficient(result: Result) -> FloatArray | None:
+    """(reflector,) what the simulation had, else what was found."""
+    if result.reflection is None:
+        return None
+    found = result.reflection.coefficient.reshape(-1, result.reflection.coefficient.shape[-1])
+    known = found[np.isfinite(found).all(axis=1)]
+    value = np.median(known.real, axis=0) + 1j * np.median(known.imag, axis=0) if len(known) else 0.0 * found[0]
+    ground = result.scenario.simulation.ground
+    if ground is not None and result.settings.get("reflection") in ("estimate", "known"):
+        value[0] = complex(*ground.coefficient)
+    return np.asarray(value)
 
 
-def _combine(sigma: FloatArray) -> FloatArray:
-    """Return the standard deviation of the weighted mean over the last axis; NaN entries do not take part."""
-    information = np.nansum(sigma**-2.0, axis=-1)
-    with np.errstate(divide="ignore"):
-        return np.where(information > 0.0, information**-0.5, np.nan)
-
-
-def _normal_bound(
-    scenario: Scenario, receiver_enu_m: FloatArray, own_m: FloatArray, calibration_m: FloatArray
-) -> FloatArray:
-    """Return the bound of the angle of each mirror's normal (frame, heliostat) [rad]."""
-    bound = np.full((len(receiver_enu_m), len(scenario.heliostat)), np.nan)
-    received = np.isfinite(own_m) & np.isfinite(calibration_m)
-    own_m, calibration_m = (np.where(received, a, np.nan) for a in (own_m, calibration_m))
-    for i, heliostat in enumerate(scenario.heliostat):
-        rows = scenario.receiver_rows(i)
-        bound[:, i] = normal_bound(
-            scenario.transmitter_enu_m,
-            receiver_enu_m[:, rows],
-            own_m[:, rows],
-            calibration_m[:, rows],
-            receiver_mirror_m=heliostat.receiver_mirror_m,
-        ).sigma_rad
-    return bound
+def _protection(result: Result, normal_error: FloatArray) -> Protection | None:
+    if result.integrity is None:
+        return None
+    level = result.integrity.protection_level_rad
+    covered = np.isfinite(level) & np.isfinite(normal_error)
+    exceeded = covered & (normal_error > level)
+    return Protection(
+        level_mrad=Statistics.of(1e3 * level[covered]),
+        covered=int(np.count_nonzero(covered)),
+        exceeded=int(np.count_nonzero(exceeded)),
+        excluded=int(np.count_nonzero(result.integrity.transmitter_status > TransmitterStatus.NOT_RECEIVED)),
+    )

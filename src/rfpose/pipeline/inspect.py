@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from rfpose.errors import GeometryError, ScenarioError
+from rfpose.pipeline.choice import POSES
 from rfpose.pipeline.result_file import frame_time, is_result, read_result, summarise
-from rfpose.pipeline.solve import POSES, check_solvable
+from rfpose.pipeline.solve import check_solvable
 from rfpose.recording import describe, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
@@ -54,6 +55,8 @@ def _scenario(scenario: Scenario) -> dict[str, Any]:
         "sample_rate_hz": radio.sample_rate_hz,
         "centre_frequency_hz": radio.centre_frequency_hz,
         "frame_samples": radio.frame_samples,
+        "reflection": scenario.reflection.model,
+        "integrity": "on" if scenario.integrity.enabled else "off",
         "frame_s": radio.frame_samples / radio.sample_rate_hz,
         "problems": problems,
         "sound": not problems,
@@ -66,6 +69,8 @@ def _result(path: Path) -> dict[str, Any]:
     times = [frame_time(int(starts[i]), result.sample_rate).isoformat() for i in (0, -1)] if len(starts) else [None] * 2
     summary = summarise(result)
     problems = [f"{count} poses: {reason}" for reason, count in summary["poses"]["reasons"].items()]
+    for name, count in summary.get("integrity", {}).get("priors_rejected", {}).items():
+        problems.append(f"{count} poses: {name} of the scenario contradicts the data and was left out")
     return {
         "scenario": result.scenario.name,
         "settings": dict(result.settings),

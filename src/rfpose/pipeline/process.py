@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,10 @@ from rfpose import __version__
 from rfpose.dsp import ESTIMATORS
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.pipeline._journal import Journal
+from rfpose.pipeline.choice import PoseChoice, choose
 from rfpose.pipeline.files import refuse_existing
 from rfpose.pipeline.measure import journal_key, measure_tones
+from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.result_file import Result, write_result
 from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.pipeline.truth_rows import align_truth
@@ -33,6 +35,8 @@ def process(
     scenario_path: str | Path | None = None,
     estimator: str = "hilbert",
     pose: str = "rigid",
+    reflection: str | None = None,
+    integrity: bool | None = None,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,
@@ -53,7 +57,11 @@ def process(
     estimator
         How tone phases are measured, one of `rfpose.dsp.ESTIMATORS`.
     pose
-        How normals follow from phases, one of `rfpose.pipeline.solve.POSES`.
+        How normals follow from phases, one of `rfpose.pipeline.choice.POSES`.
+    reflection
+        One of `rfpose.pipeline.choice.REFLECTIONS`; None: as the scenario's ``[reflection]`` says.
+    integrity
+        Whether residuals are tested and bad transmitters left out; None: as the scenario's ``[integrity]`` says.
     force
         Overwrite an existing result, and discard unfinished work of another job on the same result.
     on_progress
@@ -70,7 +78,7 @@ def process(
     GeometryError
         The site admits no solution, or an ambiguous one.
     InvalidInputError
-        Unknown ``estimator`` or ``pose``.
+        Unknown ``estimator``, ``pose`` or ``reflection``, or a choice that the pose cannot follow.
     """
     recording_path, result_path = Path(recording_path), Path(result_path)
     if estimator not in ESTIMATORS:
@@ -80,7 +88,8 @@ def process(
     with open_recording(recording_path) as recording:
         scenario = _choose_scenario(recording, given)
         check_against(recording, scenario)
-        check_solvable(scenario, pose=pose)
+        choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity)
+        check_solvable(scenario, pose=pose, choice=choice)
         _note_differing_receivers(recording, scenario)
         starts = _frames(recording, scenario)
         journal = Journal(
@@ -92,7 +101,8 @@ def process(
         tones = measure_tones(
             recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
         )
-        settings = _settings(recording, estimator=estimator, pose=pose, scenario_path=scenario_path)
+        asked = {"reflection": reflection, "integrity": integrity}
+        settings = _settings(recording, scenario, choice, estimator=estimator, asked=asked, scenario_path=scenario_path)
         truth = None if recording.truth is None else align_truth(recording.truth, scenario)
     result = solve(tones, scenario, settings=settings, truth=truth)
     write_result(result, result_path)
@@ -137,11 +147,24 @@ def _frames(recording: Recording, scenario: Scenario) -> npt.NDArray[np.int64]:
     return starts
 
 
-def _settings(recording: Recording, *, estimator: str, pose: str, scenario_path: str | Path | None) -> dict[str, str]:
+def _settings(
+    recording: Recording,
+    scenario: Scenario,
+    choice: PoseChoice,
+    *,
+    estimator: str,
+    asked: Mapping[str, object],
+    scenario_path: str | Path | None,
+) -> dict[str, str]:
     """Return what the result depends on, without places and times: equal work gives equal bytes."""
-    command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {pose}"
+    command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {choice.pose}"
     if scenario_path is not None:
         command += f" --scenario {Path(scenario_path).name}"
+    if asked["reflection"] is not None:
+        command += f" --reflection {asked['reflection']}"
+    if asked["integrity"] is not None:
+        command += " --integrity" if asked["integrity"] else " --no-integrity"
+    learns = choice.pose == "rigid" and any(group.learns_delays for group in mirror_groups(scenario))
     return {
         "version": __version__,
         "command": command,
@@ -150,5 +173,6 @@ def _settings(recording: Recording, *, estimator: str, pose: str, scenario_path:
         "sample_rate": str(recording.sample_rate),
         "scenario_from": "recording" if scenario_path is None else "file",
         "estimator": estimator,
-        "pose": pose,
+        **choice.as_settings(),
+        "delays": "learned" if learns else "as the scenario says",
     }

@@ -24,6 +24,8 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, ScenarioError
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus
+from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.pipeline.files import write_atomically
 from rfpose.scenario import Scenario, parse_scenario
 from rfpose.truth import Truth
@@ -31,10 +33,14 @@ from rfpose.truth import Truth
 __all__ = [
     "FORMAT",
     "KEYS",
+    "OPTIONAL",
     "VERSION",
+    "DelayTable",
     "FixTable",
+    "IntegrityTable",
     "Key",
     "PoseTable",
+    "ReflectionTable",
     "Result",
     "StatusArray",
     "count_reasons",
@@ -48,6 +54,9 @@ __all__ = [
 
 FORMAT = "rfpose-result"
 VERSION = 1
+
+NEEDED_PROBABILITY = 1e-3
+"""Residuals of the direct ray alone that are rarer than this say that a reflection is needed."""
 
 StatusArray = npt.NDArray[np.int8]
 
@@ -129,6 +138,79 @@ class PoseTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class IntegrityTable:
+    """What tests of the residuals found, of pose ``rigid``.
+
+    Attributes
+    ----------
+    status : (frame, heliostat)
+        `rfpose.multilat.integrity.IntegrityStatus`.
+    transmitter_status : (frame, heliostat, transmitter)
+        `rfpose.multilat.integrity.TransmitterStatus`: what was left out, and why.
+    used : (frame, receiver, transmitter)
+        Whether any of its phases is in the pose; false for calibration receivers.
+    prior_rejected, prior_testable : (frame, heliostat, prior)
+        Pivot, mount and clocks: which contradicts the data and was left out; which the data could contradict.
+    probability_all, probability : (frame, heliostat)
+        Of residuals as large or larger by noise alone, with everything, and with what was used.
+    protection_level_rad : (frame, heliostat)
+        The normal is off by more, without a warning, no more often than the scenario's ``missed_detection``, one
+        transmitter being wrong by whatever amount. Infinite where nothing protects it, NaN where there is no pose.
+    worst_transmitter : (frame, heliostat)
+        The one that sets it; −1: another explanation of an error found, or no pose.
+    """
+
+    status: StatusArray
+    transmitter_status: StatusArray
+    used: npt.NDArray[np.bool_]
+    prior_rejected: npt.NDArray[np.bool_]
+    prior_testable: npt.NDArray[np.bool_]
+    probability_all: FloatArray
+    probability: FloatArray
+    protection_level_rad: FloatArray
+    worst_transmitter: npt.NDArray[np.int16]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReflectionTable:
+    """Coefficients of what reflects, as each pose was solved with.
+
+    Attributes
+    ----------
+    coefficient : (frame, heliostat, reflector)
+        Complex, at RF; the ground first, then the scenario's planes. With Fresnel's formulas the factor on them.
+    coefficient_sigma : (frame, heliostat, reflector, 2)
+        Standard deviation of real and imaginary part; 0 where given, NaN where not determined.
+    probability_direct : (frame, heliostat)
+        Of the residuals that the direct ray alone leaves in the tones: small says that the reflection is needed.
+    """
+
+    coefficient: npt.NDArray[np.complex128]
+    coefficient_sigma: FloatArray
+    probability_direct: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DelayTable:
+    """Delays between a mirror's receivers, learned over frames.
+
+    Attributes
+    ----------
+    delay_s : (frame, receiver, clock)
+        Less that of the mirror's first receiver, after the frame [s]. Clocks: tones from the coarsest on, then the
+        carrier. NaN: not learned, or nothing seen yet.
+    sigma_s : (frame, receiver, clock)
+        Its standard deviation [s].
+    jumped : (frame, heliostat)
+        A delay had jumped: all of the mirror's were learned anew from this frame.
+    """
+
+    delay_s: FloatArray
+    sigma_s: FloatArray
+    jumped: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
     """All that processing a recording found.
 
@@ -142,6 +224,8 @@ class Result:
         First sample of each frame, counted from the Unix epoch at the recording's sample rate.
     tones, calibration, ranges, fixes, poses
         The stages in order.
+    integrity, reflection, delays
+        What else the chosen estimator of poses found; None where it does not look for it.
     truth
         What was really there, copied from a simulated recording; else None.
     """
@@ -154,6 +238,9 @@ class Result:
     ranges: RangeDifferences
     fixes: FixTable
     poses: PoseTable
+    integrity: IntegrityTable | None = None
+    reflection: ReflectionTable | None = None
+    delays: DelayTable | None = None
     truth: Truth | None = None
 
     @property
@@ -228,6 +315,21 @@ KEYS: Mapping[str, Key] = {
     "poses/n_wavelength": Key(_FH, "i2", "1", "wavelengths (tones, carrier) with resolved integers; 0: independent"),
     "poses/integer_risk": Key(_FH, "f8", "1", "largest probability of a wrong integer beforehand"),
     "poses/status": Key(_FH, "i1", "code", "why a pose is missing, 0 solved"),
+    "integrity/status": Key(_FH, "i1", "code", "what tests of the residuals say, 0 consistent"),
+    "integrity/transmitter_status": Key((*_FH, "transmitter"), "i1", "code", "what was left out and why, 0 used"),
+    "integrity/used": Key(_FRT, "?", "1", "whether any of its phases is in the pose"),
+    "integrity/prior_rejected": Key((*_FH, 3), "?", "1", "pivot, mount, clocks: contradicts the data, left out"),
+    "integrity/prior_testable": Key((*_FH, 3), "?", "1", "pivot, mount, clocks: the data could contradict it"),
+    "integrity/probability_all": Key(_FH, "f8", "1", "of residuals so large by chance, with everything"),
+    "integrity/probability": Key(_FH, "f8", "1", "of residuals so large by chance, with what was used"),
+    "integrity/protection_level_rad": Key(_FH, "f8", "rad", "what the normal's error does not exceed unnoticed"),
+    "integrity/worst_transmitter": Key(_FH, "i2", "index", "transmitter that sets the protection level, -1 none"),
+    "reflection/coefficient": Key((*_FH, "reflector"), "c16", "1", "reflection coefficient; the ground first"),
+    "reflection/coefficient_sigma": Key((*_FH, "reflector", 2), "f8", "1", "of real and imaginary part; 0 given"),
+    "reflection/probability_direct": Key(_FH, "f8", "1", "of residuals so large by chance, with the direct ray alone"),
+    "delays/delay_s": Key((*_FR, "clock"), "f8", "s", "delay less that of the mirror's first receiver"),
+    "delays/sigma_s": Key((*_FR, "clock"), "f8", "s", "its standard deviation"),
+    "delays/jumped": Key(_FH, "?", "1", "a delay had jumped and was learned anew"),
     "truth/frame_start_index": Key(("truth_frame",), "i8", "sample", "frames of the truth"),
     "truth/normal_enu": Key(("truth_frame", "heliostat", 3), "f8", "1", "true mirror normal"),
     "truth/receiver_enu_m": Key(("truth_frame", "receiver", 3), "f8", "m", "true receiver position"),
@@ -236,7 +338,10 @@ KEYS: Mapping[str, Key] = {
     "truth/receiver_delay_s": Key(("truth_frame", "receiver"), "f8", "s", "true hardware delay"),
     "truth/tone_snr": Key(("truth_frame", "receiver", "transmitter", "tone"), "f8", "1", "true SNR per sample"),
 }
-"""Datasets by path. Those under ``truth/`` may be absent, each on its own."""
+"""Datasets by path. Those under ``truth/`` may be absent, each on its own; those of `OPTIONAL` all together."""
+
+OPTIONAL: Mapping[str, type[Any]] = {"integrity": IntegrityTable, "reflection": ReflectionTable, "delays": DelayTable}
+"""Groups that are there where the estimator of poses makes them."""
 
 _STATUS: Mapping[str, type[IntEnum]] = {
     "tones/status": LineStatus,
@@ -244,6 +349,8 @@ _STATUS: Mapping[str, type[IntEnum]] = {
     "ranges/status": RangeStatus,
     "fixes/status": FixStatus,
     "poses/status": PoseStatus,
+    "integrity/status": IntegrityStatus,
+    "integrity/transmitter_status": TransmitterStatus,
 }
 
 
@@ -276,6 +383,10 @@ def write_result(result: Result, path: str | Path) -> None:
         for group in ("tones", "calibration", "ranges", "fixes", "poses"):
             record = getattr(result, group)
             for name in _group_keys(group):
+                _write(file, f"{group}/{name}", getattr(record, name))
+        for group in OPTIONAL:
+            record = getattr(result, group)
+            for name in _group_keys(group) if record is not None else ():
                 _write(file, f"{group}/{name}", getattr(record, name))
         if result.truth is not None:
             for name in _group_keys("truth"):
@@ -372,6 +483,7 @@ class _Reader:
             ranges=RangeDifferences(**self._group("ranges")),
             fixes=FixTable(**self._group("fixes")),
             poses=PoseTable(**self._group("poses")),
+            **{name: record(**self._group(name)) for name, record in OPTIONAL.items() if name in self._file},
             truth=self._truth(scenario),
         )
 
@@ -458,7 +570,71 @@ def summarise(result: Result) -> dict[str, Any]:
     for name, (status, codes) in parts.items():
         solved = int(np.count_nonzero(status == 0))
         summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
+    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says"}
+    summary["choice"] = {name: result.settings.get(name, default) for name, default in choice.items()}
+    if result.integrity is not None:
+        summary["integrity"] = _summary_of_integrity(result, result.integrity)
+    if result.reflection is not None:
+        summary["reflection"] = _summary_of_reflection(result, result.reflection)
+    if result.delays is not None:
+        summary["delays"] = _summary_of_delays(result.delays)
     return summary
+
+
+def _summary_of_integrity(result: Result, table: IntegrityTable) -> dict[str, Any]:
+    excluded = {}
+    for i, name in enumerate(result.scenario.transmitter_ids):
+        status = table.transmitter_status[..., i]
+        reasons = count_reasons(np.where(status > TransmitterStatus.NOT_RECEIVED, status, 0), TransmitterStatus)
+        if reasons:
+            excluded[name] = reasons
+    level = table.protection_level_rad[np.isfinite(table.protection_level_rad)]
+    return {
+        "reasons": count_reasons(table.status, IntegrityStatus),
+        "excluded": excluded,
+        "priors_rejected": {
+            name: int(np.count_nonzero(table.prior_rejected[..., k]))
+            for k, name in enumerate(PRIORS)
+            if np.any(table.prior_rejected[..., k])
+        },
+        "protected": int(level.size),
+        "protection_level_mrad": 1e3 * float(np.median(level)) if level.size else None,
+    }
+
+
+def _summary_of_reflection(result: Result, table: ReflectionTable) -> dict[str, Any]:
+    names = ("ground", *(plane.name for plane in result.scenario.reflection.plane))
+    needed = table.probability_direct < NEEDED_PROBABILITY
+    return {
+        "needed": int(np.count_nonzero(needed)),
+        "coefficients": {
+            name: _summary_of_coefficient(table.coefficient[..., p], table.coefficient_sigma[..., p, :])
+            for p, name in enumerate(names)
+        },
+    }
+
+
+def _summary_of_coefficient(coefficient: npt.NDArray[np.complex128], sigma: FloatArray) -> dict[str, Any]:
+    known = np.isfinite(coefficient.real) & np.isfinite(sigma).all(axis=-1)
+    if not np.any(known):
+        return {"status": "not determined", "real": None, "imag": None, "sigma": None}
+    value, spread = coefficient[known], np.hypot(sigma[known][:, 0], sigma[known][:, 1])
+    return {
+        "status": "given" if np.all(spread == 0.0) else "estimated",
+        "real": float(np.median(value.real)),
+        "imag": float(np.median(value.imag)),
+        "sigma": float(np.median(spread)),
+    }
+
+
+def _summary_of_delays(table: DelayTable) -> dict[str, Any]:
+    last = table.sigma_s[-1]
+    # the first receiver's delay is zero by definition
+    learned = last[np.isfinite(last) & (last > 0.0)]
+    return {
+        "jumps": int(np.count_nonzero(table.jumped)),
+        "last_sigma_ps": 1e12 * float(np.median(learned)) if learned.size else None,
+    }
 
 
 CSV_COLUMNS = (

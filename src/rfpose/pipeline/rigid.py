@@ -1,26 +1,31 @@
-"""Rigid poses of a recording's mirrors: which phases, clocks and priors go in, by the scenario."""
+"""Rigid poses of a recording's mirrors by the chosen estimator: direct or two-ray, guarded, delays learned."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from fractions import Fraction
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
-from rfpose.checks import FloatArray
+from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, TonePhases
-from rfpose.dsp.bounds import phase_bound_rad
-from rfpose.geometry import azimuth_elevation_from_enu, rot_enu_from_mirror
+from rfpose.geometry import azimuth_elevation_from_enu
 from rfpose.multilat import PoseStatus, RangeDifferences
-from rfpose.multilat.rigid import Knowledge, RigidStatus, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.ground import GroundSolution, GroundStatus, guard_with_ground, solve_with_ground
+from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
+from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, full_covariance, solve_rigid
+from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import Observation, align_points, solve_ladder
-from rfpose.pipeline.result_file import FixTable, PoseTable, Result
-from rfpose.scenario import Heliostat, Scenario
-from rfpose.truth import Truth
+from rfpose.pipeline.choice import PoseChoice, reflectors_of
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_share, carrier_rf_hz, mirror_groups, observations
+from rfpose.pipeline.result_file import DelayTable, FixTable, IntegrityTable, PoseTable, ReflectionTable
+from rfpose.scenario import Scenario
 
-__all__ = ["rigid_normal_bound", "solve_rigid_poses"]
+__all__ = ["RigidOutcome", "solve_rigid_poses"]
 
 _RESIDUAL_PROBABILITY = 1e-9
 """A pose whose residuals are rarer than this under the reported noise is marked."""
@@ -30,63 +35,64 @@ _STATUS = {
     RigidStatus.SINGULAR: PoseStatus.UNDETERMINED,
     RigidStatus.NOT_CONVERGED: PoseStatus.NOT_CONVERGED,
     RigidStatus.NO_START: PoseStatus.TOO_FEW,
-    RigidStatus.TOO_FEW: PoseStatus.TOO_FEW,
+    RigidStatus.TOO_FEW: PoseStatus.UNKNOWNS,
 }
+_GROUND_STATUS = {
+    GroundStatus.OK: PoseStatus.OK,
+    GroundStatus.SINGULAR: PoseStatus.UNDETERMINED,
+    GroundStatus.NOT_CONVERGED: PoseStatus.NOT_CONVERGED,
+    GroundStatus.NO_START: PoseStatus.TOO_FEW,
+    GroundStatus.TOO_FEW: PoseStatus.UNKNOWNS,
+    GroundStatus.BEHIND_REFLECTOR: PoseStatus.BEHIND_REFLECTOR,
+    GroundStatus.RESIDUAL: PoseStatus.UNEXPLAINED,
+}
+_START_SIGMA_M = 3.0
+"""Uncertainty of ranges from a pose that ignores reflections."""
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Group:
-    """Heliostats that differ in nothing but place: solved in one call."""
+class RigidOutcome:
+    """Poses, and what else their estimator found; None where it does not look for it."""
 
-    column: npt.NDArray[np.int64]
-    rows: npt.NDArray[np.int64]
-    """(heliostat, receiver) rows of the receiver axis."""
-    places_m: FloatArray
-    """(heliostat, receiver, xyz) from the pivot, in the mirror frame [m]."""
-    pivot_enu_m: FloatArray
-    kind: Heliostat
-
-    @property
-    def uses_carrier(self) -> bool:
-        """Whether carriers can be compared between the receivers: only on one oscillator do their phases cancel."""
-        return self.kind.oscillator == "shared" and self.kind.carrier_phase
-
-    def knowledge(self, scenario: Scenario, n_frame: int) -> Knowledge:
-        """Return what the scenario knows of these mirrors, one row a frame and heliostat."""
-        kind = self.kind
-        delay = kind.receiver_delay_sigma_s
-        shared = kind.oscillator == "shared" and delay is not None
-        return Knowledge(
-            clock_sigma_m=float(delay or 0.0) * scenario.radio.propagation_speed_mps if shared else np.inf,
-            pivot_enu_m=np.tile(self.pivot_enu_m, (n_frame, 1)) if kind.pivot_sigma_m is not None else None,
-            pivot_sigma_m=np.inf if kind.pivot_sigma_m is None else kind.pivot_sigma_m,
-            two_axis=kind.mount == "azimuth_elevation",
-        )
+    poses: PoseTable
+    integrity: IntegrityTable | None
+    reflection: ReflectionTable | None
+    delays: DelayTable | None
 
 
-def _groups(scenario: Scenario) -> Iterator[_Group]:
-    """Sort heliostats by number of receivers and by what is known of them."""
-    kinds: dict[tuple[object, ...], list[int]] = {}
-    for i, h in enumerate(scenario.heliostat):
-        key = (
-            len(h.receiver_ids),
-            h.oscillator,
-            h.receiver_delay_sigma_s,
-            h.pivot_sigma_m,
-            h.mount,
-            h.carrier_phase,
-        )
-        kinds.setdefault(key, []).append(i)
-    for members in kinds.values():
-        helio = [scenario.heliostat[i] for i in members]
-        arm = np.array([[0.0, 0.0, h.arm_m] for h in helio])
-        yield _Group(
-            column=np.array(members),
-            rows=np.array([np.arange(len(scenario.receivers))[scenario.receiver_rows(i)] for i in members]),
-            places_m=np.array([h.receiver_mirror_m for h in helio]) + arm[:, None],
-            pivot_enu_m=scenario.pivot_enu_m[members],
-            kind=helio[0],
-        )
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Stages:
+    """What the stages before found, and how to go on."""
+
+    tones: TonePhases
+    calibration: Calibration
+    ranges: RangeDifferences
+    fixes: FixTable
+    scenario: Scenario
+    choice: PoseChoice
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Found:
+    """Poses of one group; first axis frame × heliostat. ``status`` is `PoseStatus`."""
+
+    poses: RigidPoses
+    status: IntArray
+    fixed: BoolArray
+    wrong_risk: FloatArray
+    ranges: list[Observation]
+    """As used: integers resolved, NaN where left out."""
+    known: Knowledge
+    full_cov: FloatArray | None = None
+    guard: GuardedPoses | None = None
+    probability_all: FloatArray | None = None
+    coefficient: npt.NDArray[np.complex128] | None = None
+    coefficient_sigma: FloatArray | None = None
+    probability_direct: FloatArray | None = None
 
 
 def solve_rigid_poses(
@@ -96,7 +102,10 @@ def solve_rigid_poses(
     fixes: FixTable,
     independent: PoseTable,
     scenario: Scenario,
-) -> PoseTable:
+    choice: PoseChoice,
+    *,
+    sample_rate: Fraction,
+) -> RigidOutcome:
     """Solve every mirror of every frame as a rigid body.
 
     The coarsest tone comes first, finer tones and the carrier follow where their whole wavelengths are safe. The
@@ -110,48 +119,360 @@ def solve_rigid_poses(
         Normals of separately located receivers: where a mirror cannot be solved as a whole, its status.
     scenario
         The site.
+    choice
+        The estimator; its ``pose`` is ``rigid``.
+    sample_rate
+        Of the recording, for the time between frames [1/s].
     """
-    table = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
-    for name in ("normal_enu", "cov_enu", "sigma_rad", "azimuth_rad", "elevation_rad", "centre_enu_m", "integer_risk"):
-        table[name][:] = np.nan
-    n_frame = len(tones.frame_start_index)
-    for group in _groups(scenario):
-        n = n_frame * len(group.column)
-        places = np.tile(group.places_m, (n_frame, 1, 1))
-        start, rot = align_points(places, fixes.position_enu_m[:, group.rows].reshape(n, -1, 3))
-        solution = solve_ladder(
-            scenario.transmitter_enu_m,
-            places,
-            _observations(tones, calibration, ranges, scenario, group),
-            start_pivot_enu_m=start,
-            start_rot_enu_from_mirror=rot,
-            knowledge=group.knowledge(scenario, n_frame),
+    stages = _Stages(tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice)
+    tables = _Tables(stages, independent)
+    start = tones.frame_start_index
+    time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
+    for group in mirror_groups(scenario):
+        found = _two_ray(stages, group) if choice.reflection != "none" else _direct(stages, group)
+        if group.learns_delays:
+            found = tables.put_delays(group, found, time_s)
+        tables.put(group, found)
+    return tables.outcome()
+
+
+# -- the direct ray alone ------------------------------------------------------------------------------------
+
+
+def _direct(stages: _Stages, group: MirrorGroup) -> _Found:
+    """Solve by the direct ray: leave out what is wrong in the coarsest tone, climb, test all wavelengths together."""
+    scenario = stages.scenario
+    places, start, rot, phases = _inputs(stages, group)
+    known = group.knowledge(scenario, len(stages.tones.frame_start_index))
+    first: GuardedPoses | None = None
+    if stages.choice.integrity:
+        first = _guard(scenario, places, phases[:1], start, rot, known)
+        phases = _keep(phases, first.used)
+    ladder = solve_ladder(
+        scenario.transmitter_enu_m,
+        places,
+        phases,
+        start_pivot_enu_m=start,
+        start_rot_enu_from_mirror=rot,
+        knowledge=known,
+    )
+    found = _Found(
+        poses=ladder.poses,
+        status=_pose_status(ladder.poses.status),
+        fixed=ladder.fixed,
+        wrong_risk=ladder.wrong_risk,
+        ranges=[replace(o, range_m=z) for o, z in zip(phases, ladder.range_m, strict=True)],
+        known=known,
+    )
+    probability = _probability(ladder.poses)
+    if first is None:
+        found.status[(found.status == PoseStatus.OK) & (probability < _RESIDUAL_PROBABILITY)] = PoseStatus.RESIDUAL
+        return found
+    at, at_rot = _or(ladder.poses.pivot_enu_m, start), _or(ladder.poses.rot_enu_from_mirror, rot)
+    guard = _joined(first, _guard(scenario, places, found.ranges, at, at_rot, known))
+    status = _pose_status(guard.poses.status)
+    status[(status == PoseStatus.OK) & (guard.status == IntegrityStatus.UNEXPLAINED)] = PoseStatus.UNEXPLAINED
+    return replace(
+        found,
+        poses=guard.poses,
+        status=status,
+        ranges=_keep(found.ranges, guard.used),
+        guard=guard,
+        probability_all=_probability_of_all(stages, group, first, probability),
+    )
+
+
+def _inputs(stages: _Stages, group: MirrorGroup) -> tuple[FloatArray, FloatArray, FloatArray, list[Observation]]:
+    """Places of receivers, poses to begin with (pivot, rotation), and phases as ranges."""
+    n_frame = len(stages.tones.frame_start_index)
+    places = np.tile(group.places_m, (n_frame, 1, 1))
+    located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
+    start, rot = align_points(places, located)
+    phases = observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group)
+    return places, start, rot, phases
+
+
+def _guard(
+    scenario: Scenario,
+    places: FloatArray,
+    phases: list[Observation],
+    pivot: FloatArray,
+    rot: FloatArray,
+    known: Knowledge,
+) -> GuardedPoses:
+    """Solve, test and leave out, with integers resolved."""
+    table = scenario.integrity
+    return solve_with_integrity(
+        scenario.transmitter_enu_m,
+        places,
+        np.stack([o.range_m for o in phases], axis=1),
+        sigma_m=np.stack([o.sigma_m for o in phases], axis=1),
+        transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in phases], axis=1),
+        clock_class=[o.clock_class for o in phases],
+        start_pivot_enu_m=pivot,
+        start_rot_enu_from_mirror=rot,
+        knowledge=known,
+        false_alarm=table.false_alarm,
+        missed_detection=table.missed_detection,
+        max_excluded=table.max_excluded,
+    )
+
+
+def _joined(first: GuardedPoses, second: GuardedPoses) -> GuardedPoses:
+    """Join the tests before and after a change of what is used: what the first left out, the second does not see."""
+    cause = np.where(
+        second.transmitter_status > TransmitterStatus.NOT_RECEIVED, second.transmitter_status, first.transmitter_status
+    )
+    status = second.status.copy()
+    level = second.protection_level_rad.copy()
+    quiet = np.isin(second.status, (IntegrityStatus.OK, IntegrityStatus.EXCLUDED))
+    excluded = (cause > TransmitterStatus.NOT_RECEIVED).any(axis=1)
+    status[quiet & excluded] = IntegrityStatus.EXCLUDED
+    # which of several causes an error had is not known better afterwards
+    ambiguous = quiet & (first.status == IntegrityStatus.AMBIGUOUS)
+    status[ambiguous] = IntegrityStatus.AMBIGUOUS
+    level[ambiguous] = np.fmax(level, first.protection_level_rad)[ambiguous]
+    lost = quiet & (first.status == IntegrityStatus.UNEXPLAINED)
+    status[lost] = IntegrityStatus.UNEXPLAINED
+    level[lost] = np.inf
+    return replace(
+        second,
+        status=read_only(status),
+        transmitter_status=read_only(cause),
+        protection_level_rad=read_only(level),
+        prior_testable=read_only(first.prior_testable | second.prior_testable),
+        chi2_probability=second.chi2_probability,
+    )
+
+
+def _probability_of_all(
+    stages: _Stages, group: MirrorGroup, first: GuardedPoses, probability: FloatArray
+) -> FloatArray:
+    """Probability of the residuals with nothing left out: where something was, of the coarsest tone's."""
+    out = probability.copy()
+    rows = np.flatnonzero((first.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1))
+    if not rows.size:
+        return out
+    places, start, rot, phases = _inputs(stages, group)
+    known = group.knowledge(stages.scenario, len(stages.tones.frame_start_index))
+    if known.pivot_enu_m is not None:
+        known = replace(known, pivot_enu_m=known.pivot_enu_m[rows])
+    coarse = phases[0]
+    poses = solve_rigid(
+        stages.scenario.transmitter_enu_m,
+        places[rows],
+        coarse.range_m[rows][:, None],
+        sigma_m=coarse.sigma_m[rows][:, None],
+        transmitter_sigma_m=coarse.transmitter_sigma_m[rows][:, None],
+        clock_class=[0],
+        start_pivot_enu_m=start[rows],
+        start_rot_enu_from_mirror=rot[rows],
+        knowledge=known,
+    )
+    out[rows] = _probability(poses)
+    return out
+
+
+# -- with reflections ----------------------------------------------------------------------------------------
+
+
+def _two_ray(stages: _Stages, group: MirrorGroup) -> _Found:
+    """Solve with the planes of the scenario, their coefficients shared as it says."""
+    scenario = stages.scenario
+    n_frame, n_helio = len(stages.tones.frame_start_index), len(group.column)
+    places, start, rot, phases = _inputs(stages, group)
+    known = group.knowledge(scenario, n_frame)
+    start, rot = _better_start(scenario, places, phases, start, rot, known)
+    row = np.arange(n_frame * n_helio).reshape(n_frame, n_helio)
+    shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
+    parts = []
+    for rows in shared:
+        mine = known if known.pivot_enu_m is None else replace(known, pivot_enu_m=known.pivot_enu_m[rows])
+        these = [_taken(o, rows) for o in phases]
+        parts.append(_two_ray_of(stages, places[rows], these, start[rows], rot[rows], mine))
+    return _in_order(parts, np.argsort(np.concatenate(shared)), known)
+
+
+def _better_start(
+    scenario: Scenario,
+    places: FloatArray,
+    phases: list[Observation],
+    start: FloatArray,
+    rot: FloatArray,
+    known: Knowledge,
+) -> tuple[FloatArray, FloatArray]:
+    """Start from rigid poses by the direct ray; separately located receivers are too far off where ground reflects."""
+    coarse = phases[0]
+    poses = solve_rigid(
+        scenario.transmitter_enu_m,
+        places,
+        coarse.range_m[:, None],
+        sigma_m=coarse.sigma_m[:, None],
+        transmitter_sigma_m=coarse.transmitter_sigma_m[:, None],
+        clock_class=[0],
+        start_pivot_enu_m=start,
+        start_rot_enu_from_mirror=rot,
+        knowledge=known,
+    )
+    pivot = _or(poses.pivot_enu_m, start)
+    if known.pivot_enu_m is not None:
+        pivot = np.where(np.isfinite(pivot), known.pivot_enu_m, np.nan)
+    return pivot, _or(poses.rot_enu_from_mirror, rot)
+
+
+def _two_ray_of(
+    stages: _Stages,
+    places: FloatArray,
+    phases: list[Observation],
+    start: FloatArray,
+    rot: FloatArray,
+    known: Knowledge,
+) -> _Found:
+    """Solve mirrors that share their coefficients; where a test finds something to leave out, once more without."""
+    table = stages.scenario.integrity
+
+    def guarded(solution: GroundSolution) -> GuardedPoses:
+        return guard_with_ground(
+            solution,
+            false_alarm=table.false_alarm,
+            missed_detection=table.missed_detection,
+            max_excluded=table.max_excluded,
         )
-        poses = solution.poses
-        normal = poses.normal_enu
-        azimuth, elevation = azimuth_elevation_from_enu(normal)
-        turn = poses.cov[:, 3:, 3:]
-        cross = _cross_matrix(normal)
-        centre = poses.pivot_enu_m + np.einsum("mab,mb->ma", poses.rot_enu_from_mirror, places.mean(axis=1))
-        status = np.array([_STATUS[RigidStatus(s)] for s in poses.status])
-        with np.errstate(invalid="ignore"):
-            rare = chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)) < _RESIDUAL_PROBABILITY
-        status[(status == PoseStatus.OK) & rare] = PoseStatus.RESIDUAL
-        found = {
-            "normal_enu": normal,
-            "cov_enu": cross @ turn @ cross.swapaxes(1, 2),
-            "sigma_rad": poses.tilt_sigma_rad,
-            "azimuth_rad": azimuth,
-            "elevation_rad": elevation,
-            "centre_enu_m": centre,
-            "n_receiver": np.where(np.isfinite(normal[:, 0]), group.rows.shape[1], 0),
-            "n_wavelength": solution.fixed.sum(axis=1),
-            "integer_risk": np.where(solution.fixed, solution.wrong_risk, 0.0).max(axis=1),
-            "status": status,
-        }
-        for name, values in found.items():
-            table[name][:, group.column] = values.reshape(n_frame, len(group.column), *values.shape[1:])
-    return PoseTable(**table)
+
+    solution = _solve_ground(stages, places, phases, start, rot, known)
+    probability_all, probability_direct = solution.probability, solution.probability_direct
+    guard: GuardedPoses | None = None
+    if stages.choice.integrity:
+        guard = guarded(solution)
+        if np.any(guard.transmitter_status > TransmitterStatus.NOT_RECEIVED):
+            first = guard
+            at, at_rot = _or(first.poses.pivot_enu_m, start), _or(first.poses.rot_enu_from_mirror, rot)
+            solution = _solve_ground(stages, places, _keep(phases, first.used), at, at_rot, known)
+            guard = _joined(first, guarded(solution))
+    poses = solution.poses if guard is None else guard.poses
+    status = np.array([_GROUND_STATUS[GroundStatus(s)] for s in solution.status], np.int64)
+    if guard is not None:
+        explained = np.isfinite(guard.protection_level_rad) | (guard.status == IntegrityStatus.NO_REDUNDANCY)
+        status[(status == PoseStatus.UNEXPLAINED) & explained] = PoseStatus.OK
+        status[(status == PoseStatus.OK) & (guard.status == IntegrityStatus.UNEXPLAINED)] = PoseStatus.UNEXPLAINED
+    n, n_plane = len(places), len(solution.coefficient)
+    sigma = np.zeros((n_plane, 2))
+    estimated = [p for p, r in enumerate(reflectors_of(stages.scenario, stages.choice.reflection)) if r.estimated]
+    sigma[estimated] = np.sqrt(np.diag(solution.coefficient_cov)).reshape(-1, 2)
+    return _Found(
+        poses=poses,
+        status=status,
+        fixed=solution.fixed,
+        wrong_risk=solution.wrong_risk,
+        ranges=[replace(o, range_m=z) for o, z in zip(phases, solution.range_m, strict=True)],
+        known=known,
+        full_cov=solution.full_cov,
+        guard=guard,
+        probability_all=probability_all,
+        coefficient=np.array(np.broadcast_to(solution.coefficient, (n, n_plane))),
+        coefficient_sigma=np.array(np.broadcast_to(sigma, (n, n_plane, 2))),
+        probability_direct=probability_direct,
+    )
+
+
+def _solve_ground(
+    stages: _Stages,
+    places: FloatArray,
+    phases: list[Observation],
+    start: FloatArray,
+    rot: FloatArray,
+    known: Knowledge,
+) -> GroundSolution:
+    scenario = stages.scenario
+    return solve_with_ground(
+        scenario.transmitter_enu_m,
+        places,
+        phases,
+        carrier_rf_hz=carrier_rf_hz(scenario),
+        start_pivot_enu_m=start,
+        start_rot_enu_from_mirror=rot,
+        reflectors=reflectors_of(scenario, stages.choice.reflection),
+        calibration_enu_m=scenario.calibration_enu_m,
+        calibration_share=calibration_share(stages.tones.sigma_rad, scenario),
+        tone_count=len(scenario.tone),
+        knowledge=known,
+        free_space=scenario.reflection.spreading == "free_space",
+        start_sigma_m=_START_SIGMA_M,
+        propagation_speed_mps=scenario.radio.propagation_speed_mps,
+    )
+
+
+def _in_order(parts: list[_Found], order: IntArray, known: Knowledge) -> _Found:
+    """Put mirrors solved in parts back into their order."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def joined(*arrays: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.asarray(np.concatenate(arrays)[order])
+
+    guards = [p.guard for p in parts if p.guard is not None]
+    return _Found(
+        poses=_record_of(RigidPoses, [p.poses for p in parts], joined),
+        guard=_record_of(GuardedPoses, guards, joined) if guards else None,
+        known=known,
+        ranges=[_record_of(Observation, [p.ranges[k] for p in parts], joined) for k in range(len(parts[0].ranges))],
+        **{
+            name: joined(*(getattr(p, name) for p in parts))
+            for name in (
+                "status",
+                "fixed",
+                "wrong_risk",
+                "full_cov",
+                "probability_all",
+                "coefficient",
+                "coefficient_sigma",
+                "probability_direct",
+            )
+        },
+    )
+
+
+def _record_of(kind: type[_T], records: list[_T], joined: Callable[..., npt.NDArray[Any]]) -> _T:
+    """Join records field by field; what is not by mirror is as in the first."""
+    values = {}
+    for field in fields(kind):  # type: ignore[arg-type]
+        parts = [getattr(record, field.name) for record in records]
+        if isinstance(parts[0], RigidPoses):
+            values[field.name] = _record_of(RigidPoses, parts, joined)
+        elif field.name in ("wavelength_m", "clock_class"):
+            values[field.name] = parts[0]
+        else:
+            values[field.name] = joined(*parts)
+    return kind(**values)
+
+
+# -- small things --------------------------------------------------------------------------------------------
+
+
+def _pose_status(status: IntArray) -> IntArray:
+    return np.array([_STATUS[RigidStatus(s)] for s in status], np.int64)
+
+
+def _probability(poses: RigidPoses) -> FloatArray:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)))
+
+
+def _keep(phases: list[Observation], used: BoolArray) -> list[Observation]:
+    return [replace(o, range_m=np.where(used, o.range_m, np.nan)) for o in phases]
+
+
+def _taken(phases: Observation, rows: IntArray) -> Observation:
+    return replace(
+        phases,
+        range_m=phases.range_m[rows],
+        sigma_m=phases.sigma_m[rows],
+        transmitter_sigma_m=phases.transmitter_sigma_m[rows],
+    )
+
+
+def _or(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(first), first, second)
 
 
 def _cross_matrix(v: FloatArray) -> FloatArray:
@@ -163,131 +484,181 @@ def _cross_matrix(v: FloatArray) -> FloatArray:
     return out
 
 
-def _observations(
-    tones: TonePhases, calibration: Calibration, ranges: RangeDifferences, scenario: Scenario, group: _Group
-) -> list[Observation]:
-    """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat."""
-    n_frame, n_helio = len(tones.frame_start_index), len(group.column)
-    n_receiver, n_transmitter = group.rows.shape[1], len(scenario.transmitter)
+# -- tables --------------------------------------------------------------------------------------------------
 
-    def of_mirrors(values: npt.NDArray[np.float64]) -> FloatArray:
-        return values[:, group.rows].reshape(n_frame * n_helio, n_receiver, *values.shape[2:])
 
-    out = []
-    for k, q in enumerate(np.argsort(-scenario.wavelength_m)):
-        wavelength = float(scenario.wavelength_m[q])
-        to_m = wavelength / (2.0 * np.pi)
-        z = of_mirrors(-to_m * (tones.phase_rad[..., q] - calibration.phase_rad[:, None, :, q]))
-        if k == 0:
-            z = _coarse(
-                z, of_mirrors(ranges.range_difference_m), of_mirrors(ranges.reference.astype(np.float64)), wavelength
-            )
-        per_frame = to_m * np.repeat(calibration.sigma_rad[..., q], n_helio, axis=0)
-        out.append(
-            Observation(
-                range_m=z,
-                sigma_m=of_mirrors(to_m * tones.sigma_rad[..., q]),
-                transmitter_sigma_m=per_frame,
-                wavelength_m=np.full(n_transmitter, wavelength),
-                clock_class=k,
-            )
+class _Tables:
+    """The result's tables, filled group by group."""
+
+    def __init__(self, stages: _Stages, independent: PoseTable) -> None:
+        self._stages = stages
+        scenario, choice = stages.scenario, stages.choice
+        n_frame = self._n_frame = len(stages.tones.frame_start_index)
+        frame_mirror = (n_frame, len(scenario.heliostat))
+        n_receiver, n_transmitter = len(scenario.receivers), len(scenario.transmitter)
+        self._poses = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
+        for values in self._poses.values():
+            if values.dtype.kind == "f":
+                values[:] = np.nan
+        self._integrity: dict[str, npt.NDArray[Any]] = {}
+        if choice.integrity:
+            self._integrity = {
+                "status": np.full(frame_mirror, IntegrityStatus.NOT_SOLVED, np.int8),
+                "transmitter_status": np.zeros((*frame_mirror, n_transmitter), np.int8),
+                "used": np.zeros((n_frame, n_receiver, n_transmitter), np.bool_),
+                "prior_rejected": np.zeros((*frame_mirror, 3), np.bool_),
+                "prior_testable": np.zeros((*frame_mirror, 3), np.bool_),
+                "probability_all": np.full(frame_mirror, np.nan),
+                "probability": np.full(frame_mirror, np.nan),
+                "protection_level_rad": np.full(frame_mirror, np.nan),
+                "worst_transmitter": np.full(frame_mirror, -1, np.int16),
+            }
+        self._reflection: dict[str, npt.NDArray[Any]] = {}
+        if choice.reflection != "none":
+            n_plane = 1 + len(scenario.reflection.plane)
+            self._reflection = {
+                "coefficient": np.full((*frame_mirror, n_plane), np.nan, np.complex128),
+                "coefficient_sigma": np.full((*frame_mirror, n_plane, 2), np.nan),
+                "probability_direct": np.full(frame_mirror, np.nan),
+            }
+        self._delays: dict[str, npt.NDArray[Any]] = {}
+        if any(group.learns_delays for group in mirror_groups(scenario)):
+            n_clock = len(scenario.tone) + 1
+            self._delays = {
+                "delay_s": np.full((n_frame, n_receiver, n_clock), np.nan),
+                "sigma_s": np.full((n_frame, n_receiver, n_clock), np.nan),
+                "jumped": np.zeros(frame_mirror, np.bool_),
+            }
+
+    def put(self, group: MirrorGroup, found: _Found) -> None:
+        """Write one group's poses and tests."""
+        poses = found.poses
+        normal = poses.normal_enu
+        azimuth, elevation = azimuth_elevation_from_enu(normal)
+        cross = _cross_matrix(normal)
+        places = np.tile(group.places_m, (self._n_frame, 1, 1))
+        self._put(
+            self._poses,
+            group,
+            {
+                "normal_enu": normal,
+                "cov_enu": cross @ poses.cov[:, 3:, 3:] @ cross.swapaxes(1, 2),
+                "sigma_rad": poses.tilt_sigma_rad,
+                "azimuth_rad": azimuth,
+                "elevation_rad": elevation,
+                "centre_enu_m": poses.pivot_enu_m
+                + np.einsum("mab,mb->ma", poses.rot_enu_from_mirror, places.mean(axis=1)),
+                "n_receiver": np.where(np.isfinite(normal[:, 0]), group.rows.shape[1], 0),
+                "n_wavelength": found.fixed.sum(axis=1),
+                "integer_risk": np.where(found.fixed, found.wrong_risk, 0.0).max(axis=1),
+                "status": found.status,
+            },
         )
-    if group.uses_carrier:
-        carrier_m = scenario.radio.propagation_speed_mps / (scenario.radio.centre_frequency_hz + scenario.carrier_hz)
-        to_m_each = carrier_m / (2.0 * np.pi)
-        seen = np.isfinite(tones.phase_rad[..., 0])
-        phase = np.where(seen, np.angle(tones.carrier), np.nan)
-        out.append(
-            Observation(
-                range_m=of_mirrors(-to_m_each * phase),
-                sigma_m=of_mirrors(to_m_each * tones.carrier_sigma / np.abs(tones.carrier)),
-                transmitter_sigma_m=np.full((n_frame * n_helio, n_transmitter), np.inf),
-                wavelength_m=carrier_m,
-                clock_class=len(out),
+        guard = found.guard
+        if self._integrity and guard is not None:
+            level = np.where(np.isfinite(normal[:, 0]), guard.protection_level_rad, np.nan)
+            self._put(
+                self._integrity,
+                group,
+                {
+                    "status": guard.status,
+                    "transmitter_status": guard.transmitter_status,
+                    "prior_rejected": guard.prior_rejected,
+                    "prior_testable": guard.prior_testable,
+                    "probability_all": found.probability_all,
+                    "probability": guard.chi2_probability,
+                    "protection_level_rad": level,
+                    "worst_transmitter": guard.worst_transmitter,
+                },
             )
+            used = guard.used & np.isfinite(normal[:, :1, None])
+            self._integrity["used"][:, group.rows] = used.reshape(self._n_frame, *group.rows.shape, -1)
+        if self._reflection:
+            names = ("coefficient", "coefficient_sigma", "probability_direct")
+            self._put(self._reflection, group, {name: getattr(found, name) for name in names})
+
+    def _put(self, table: dict[str, npt.NDArray[Any]], group: MirrorGroup, values: dict[str, Any]) -> None:
+        for name, array in values.items():
+            table[name][:, group.column] = array.reshape(self._n_frame, len(group.column), *array.shape[1:])
+
+    def put_delays(self, group: MirrorGroup, found: _Found, time_s: FloatArray) -> _Found:
+        """Learn the delays of a group over frames, write them, and return its poses refined by them."""
+        scenario = self._stages.scenario
+        speed = scenario.radio.propagation_speed_mps
+        n_frame, n_helio = self._n_frame, len(group.column)
+        poses, whole = found.poses, _with_clocks(scenario, group, found, n_frame)
+        # poses that are doubted, or rest on fewer priors than the rest, teach nothing
+        whole[found.status != PoseStatus.OK] = np.nan
+        if found.guard is not None:
+            whole[found.guard.prior_rejected.any(axis=1)] = np.nan
+        n_class = poses.clock_m.shape[1]
+        observed = _observed_clocks(found.ranges, n_class)
+
+        def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            return array.reshape(n_frame, n_helio, *array.shape[1:])
+
+        learned = learn_delays(
+            by_frame(poses.pivot_enu_m),
+            by_frame(poses.rot_enu_from_mirror),
+            by_frame(np.where(observed, poses.clock_m, 0.0)),
+            by_frame(whole),
+            time_s=time_s,
+            drift_m_per_sqrt_s=group.drift_m_per_sqrt_s(scenario),
+            observed=by_frame(observed),
         )
-    return out
+        n_receiver = group.rows.shape[1]
+        shape = (n_frame, n_helio, n_class, n_receiver - 1)
+        variance = np.einsum("fmdd->fmd", learned.difference_cov_m2).reshape(shape)
+        for name, values in (("delay_s", learned.difference_m.reshape(shape)), ("sigma_s", np.sqrt(variance))):
+            known = np.isfinite(values) & (variance < learned.unseen_m**2 / 2.0)
+            rows = np.where(known, values / speed, np.nan).swapaxes(2, 3)
+            self._delays[name][:, group.rows[:, 1:], :n_class] = rows
+            self._delays[name][:, group.rows[:, 0], :n_class] = np.where(known.any(axis=3), 0.0, np.nan)
+        self._delays["jumped"][:, group.column] = learned.jumped
+        refined = np.isfinite(learned.cov).all(axis=(2, 3)).reshape(-1)
+        values = {
+            "pivot_enu_m": learned.pivot_enu_m,
+            "rot_enu_from_mirror": learned.rot_enu_from_mirror,
+            "cov": learned.cov,
+        }
+        arrays = {}
+        for name, array in values.items():
+            flat = array.reshape(n_frame * n_helio, *array.shape[2:])
+            arrays[name] = np.where(refined.reshape(-1, *[1] * (flat.ndim - 1)), flat, getattr(poses, name))
+        return replace(found, poses=replace(poses, **arrays))
+
+    def outcome(self) -> RigidOutcome:
+        """Return the tables, those that were asked for."""
+        return RigidOutcome(
+            poses=PoseTable(**self._poses),
+            integrity=IntegrityTable(**self._integrity) if self._integrity else None,
+            reflection=ReflectionTable(**self._reflection) if self._reflection else None,
+            delays=DelayTable(**self._delays) if self._delays else None,
+        )
 
 
-def _coarse(z: FloatArray, difference_m: FloatArray, reference: FloatArray, wavelength: float) -> FloatArray:
-    """Give the coarsest tone's ranges the whole wavelengths that the range differences know.
-
-    A row's reference range keeps its own noise; the rows of a mirror are brought within half a wavelength of each
-    other, as near as its receivers are.
-    """
-    index = np.maximum(reference.astype(np.int64), 0)[..., None]
-    base = np.take_along_axis(z, index, axis=-1)
-    first = np.nan_to_num(np.take_along_axis(base, np.argmax(np.isfinite(base), axis=1)[:, None], axis=1))
-    base = base - wavelength * np.rint((base - first) / wavelength)
-    expected = base + difference_m
-    return z + wavelength * np.rint((expected - z) / wavelength)
-
-
-def rigid_normal_bound(
-    result: Result, truth: Truth, rows: npt.NDArray[np.int64], normal_true: FloatArray
-) -> FloatArray:
-    """Cramér–Rao bound of each mirror's normal for the rigid model (frame, heliostat) [rad].
-
-    Parameters
-    ----------
-    result
-        A result of pose ``rigid``.
-    truth
-        With ``tone_snr``; else the result's own sigmas are used.
-    rows : (frame,)
-        The truth's row of each frame, −1 none.
-    normal_true : (frame, heliostat, xyz)
-        True normals.
-    """
-    scenario = result.scenario
-    tone_sigma, carrier_sigma, calibration_sigma = _phase_noise(result, truth, rows)
-    out = np.full(normal_true.shape[:2], np.nan)
-    n_frame = len(rows)
-    for group in _groups(scenario):
-        n = n_frame * len(group.column)
-        rot = rot_enu_from_mirror(normal_true[:, group.column].reshape(n, 3))
-        sigma, common = [], []
-        for q, wavelength in enumerate(scenario.wavelength_m):
-            to_m = wavelength / (2.0 * np.pi)
-            sigma.append(to_m * tone_sigma[..., q][:, group.rows].reshape(n, *group.rows.shape[1:], -1))
-            common.append(to_m * np.repeat(calibration_sigma[..., q], len(group.column), axis=0))
-        if group.uses_carrier:
-            carrier_m = scenario.radio.propagation_speed_mps / (
-                scenario.radio.centre_frequency_hz + scenario.carrier_hz
-            )
-            sigma.append(carrier_m / (2 * np.pi) * carrier_sigma[:, group.rows].reshape(n, *group.rows.shape[1:], -1))
-            common.append(np.full((n, len(scenario.transmitter)), np.inf))
-        cov = rigid_bound(
+def _with_clocks(scenario: Scenario, group: MirrorGroup, found: _Found, n_frame: int) -> FloatArray:
+    """Covariance of pose and clocks of every mirror."""
+    if found.full_cov is not None:
+        return np.array(found.full_cov)
+    phases = found.ranges
+    return np.array(
+        full_covariance(
             scenario.transmitter_enu_m,
             np.tile(group.places_m, (n_frame, 1, 1)),
-            np.tile(group.pivot_enu_m, (n_frame, 1)),
-            rot,
-            sigma_m=np.stack(sigma, axis=1),
-            transmitter_sigma_m=np.stack(common, axis=1),
-            clock_class=np.arange(len(sigma)),
-            knowledge=group.knowledge(scenario, n_frame),
+            np.nan_to_num(found.poses.pivot_enu_m),
+            np.nan_to_num(found.poses.rot_enu_from_mirror),
+            sigma_m=np.stack([np.where(np.isfinite(o.range_m), o.sigma_m, np.nan) for o in phases], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in phases], axis=1),
+            clock_class=[o.clock_class for o in phases],
+            knowledge=found.known,
         )
-        out[:, group.column] = tilt_sigma_rad(cov, rot[:, :, 2]).reshape(n_frame, -1)
+    )
+
+
+def _observed_clocks(phases: list[Observation], n_class: int) -> BoolArray:
+    """(mirror, class, receiver) whether any range tells of a clock."""
+    out = np.zeros((len(phases[0].range_m), n_class, phases[0].range_m.shape[1]), np.bool_)
+    for phase in phases:
+        out[:, phase.clock_class] |= np.isfinite(phase.range_m).any(axis=2)
     return out
-
-
-def _phase_noise(
-    result: Result, truth: Truth, rows: npt.NDArray[np.int64]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sigma of tone phases, of carrier phases, and of the calibration [rad]; from the truth where it knows."""
-    tones = result.tones
-    if truth.tone_snr is None:
-        return tones.sigma_rad, tones.carrier_sigma / np.abs(tones.carrier), result.calibration.sigma_rad
-    scenario = result.scenario
-    snr = np.array(truth.tone_snr[np.maximum(rows, 0)])
-    snr[rows < 0] = np.nan
-    seen = np.isfinite(tones.phase_rad)
-    with np.errstate(invalid="ignore"):
-        tone = phase_bound_rad(scenario.radio.frame_samples, np.where(snr > 0, snr, np.nan))
-    tone = np.where(seen, tone, np.nan)
-    # a carrier has 2/m² times the tone's power, and all of its phase's noise
-    carrier = tone[..., 0] * scenario.tone[0].modulation_index / np.sqrt(2.0)
-    is_calibration = np.array([r.calibration is not None for r in scenario.receivers], bool)
-    with np.errstate(divide="ignore"):
-        calibration = np.nansum(tone[:, is_calibration] ** -2.0, axis=1) ** -0.5
-    return tone, carrier, calibration

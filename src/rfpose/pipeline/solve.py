@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fractions import Fraction
 
 import numpy as np
 
 from rfpose.dsp import Calibration, TonePhases, calibrate
-from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.errors import ScenarioError
 from rfpose.multilat import Fixes, Poses, RangeDifferences, check_unambiguous, range_differences, solve_poses
 from rfpose.multilat.fix import check_transmitters
+from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
 from rfpose.pipeline.result_file import FixTable, PoseTable, Result
 from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
@@ -17,13 +19,17 @@ from rfpose.truth import Truth
 
 __all__ = ["POSES", "check_solvable", "solve"]
 
-POSES = ("rigid", "independent")
-"""Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's, as
-published. ``rigid``: all phases of a mirror's receivers at once, with what the scenario says of clocks and pivots."""
 
-
-def check_solvable(scenario: Scenario, *, pose: str) -> None:
+def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None = None) -> None:
     """Refuse a site that no recording could be solved for, before any work is done.
+
+    Parameters
+    ----------
+    scenario
+    pose
+        One of `POSES`.
+    choice
+        The estimator; default: as the scenario says.
 
     Raises
     ------
@@ -32,10 +38,10 @@ def check_solvable(scenario: Scenario, *, pose: str) -> None:
     ScenarioError
         No heliostat, or no calibration receiver.
     GeometryError
-        Too few transmitters, on a line or at the same place; or the field is too wide for the longest tone.
+        Too few transmitters, on a line or at the same place; or the field is too wide for the longest tone; or
+        something stands behind a plane that is to reflect it.
     """
-    if pose not in POSES:
-        raise InvalidInputError(f"`pose` must be one of {', '.join(POSES)}, got {pose!r}")
+    chosen = choose(scenario, pose=pose) if choice is None else choice
     if not scenario.heliostat:
         raise ScenarioError(f"scenario `{scenario.name}` has no heliostat to measure; add a [[heliostat]]")
     if not scenario.calibration_receiver:
@@ -45,6 +51,7 @@ def check_solvable(scenario: Scenario, *, pose: str) -> None:
         )
     check_transmitters(scenario.transmitter_enu_m)
     check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
+    check_reflectors(scenario, reflectors_of(scenario, chosen.reflection))
 
 
 def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str], truth: Truth | None = None) -> Result:
@@ -57,7 +64,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     scenario
         The site.
     settings
-        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``.
+        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``. ``reflection`` and ``integrity``
+        choose the estimator of poses; without them the scenario does.
     truth
         Kept with the result.
 
@@ -66,7 +74,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     InvalidInputError, ScenarioError, GeometryError
         As `check_solvable`. A receiver or mirror that cannot be solved is NaN with a status.
     """
-    check_solvable(scenario, pose=settings["pose"])
+    choice = PoseChoice.of(settings, scenario)
+    check_solvable(scenario, pose=settings["pose"], choice=choice)
     calibration = calibrate(tones, scenario)
     ranges = _ranges(tones, calibration, scenario)
     poses = solve_poses(
@@ -80,6 +89,18 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     n_frame, n_receiver = tones.phase_rad.shape[:2]
     fixes = _fix_table(poses.fixes, n_frame, n_receiver)
     independent = _pose_table(poses)
+    rigid = None
+    if choice.pose == "rigid":
+        rigid = solve_rigid_poses(
+            tones,
+            calibration,
+            ranges,
+            fixes,
+            independent,
+            scenario,
+            choice,
+            sample_rate=Fraction(settings["sample_rate"]),
+        )
     return Result(
         scenario=scenario,
         settings=settings,
@@ -88,9 +109,10 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         calibration=calibration,
         ranges=ranges,
         fixes=fixes,
-        poses=solve_rigid_poses(tones, calibration, ranges, fixes, independent, scenario)
-        if settings["pose"] == "rigid"
-        else independent,
+        poses=independent if rigid is None else rigid.poses,
+        integrity=None if rigid is None else rigid.integrity,
+        reflection=None if rigid is None else rigid.reflection,
+        delays=None if rigid is None else rigid.delays,
         truth=truth,
     )
 

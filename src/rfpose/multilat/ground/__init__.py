@@ -1,6 +1,7 @@
 """Poses of rigid mirrors where ground or walls reflect."""
 
 from rfpose.multilat.ground.bound import ground_bound
+from rfpose.multilat.ground.guard import guard_with_ground
 from rfpose.multilat.ground.model import LEVEL_GROUND, Reflector, Surface, fresnel_coefficient, range_shift_m
 from rfpose.multilat.ground.solve import GroundSolution, GroundStatus, solve_with_ground
 
@@ -12,6 +13,7 @@ __all__ = [
     "Surface",
     "fresnel_coefficient",
     "ground_bound",
+    "guard_with_ground",
     "range_shift_m",
     "solve_with_ground",
 ]

@@ -34,7 +34,7 @@ from rfpose.multilat.rigid.arrays import spread_places
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus
 
-__all__ = ["GroundSolution", "GroundStatus", "solve_with_ground"]
+__all__ = ["GroundSolution", "GroundStatus", "joint_covariance", "solve_with_ground", "turns"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -98,6 +98,8 @@ class GroundSolution:
         A small first one says that reflections are needed.
     status : (mirror,)
         `GroundStatus`.
+    problem, state, parameter
+        What was solved, where it ended and the estimated coefficients, for tests that solve it again with less.
     """
 
     poses: RigidPoses
@@ -110,6 +112,9 @@ class GroundSolution:
     probability_direct: FloatArray
     probability: FloatArray
     status: IntArray
+    problem: Problem
+    state: State
+    parameter: FloatArray
 
 
 def solve_with_ground(
@@ -215,7 +220,7 @@ def solve_with_ground(
     status[(status == GroundStatus.OK) & (problem.dof < 0)] = GroundStatus.TOO_FEW
     start = State.begin(pivot, rot, clock, status, problem.n_parameter)
     probability_direct = _direct_probability(problem, start)
-    turn = _turns()
+    turn = turns()
     parameter = _coefficients.find(problem, start, turn)
     state = start.copy()
     problem.fit(state, parameter)
@@ -291,7 +296,7 @@ def _behind(places: FloatArray, pivot: FloatArray, rot: FloatArray, reflectors: 
     return np.asarray(np.any(behind, axis=0)) if behind else np.zeros(len(places), np.bool_)
 
 
-def _turns() -> FloatArray:
+def turns() -> FloatArray:
     """Rotation vectors spread over a ball, small ones first; none at all is first of all."""
     cube = 2.0 * qmc.Halton(3, scramble=False).random(_N_TURN) - 1.0
     length = np.linalg.norm(cube, axis=1)
@@ -345,6 +350,7 @@ def _solution(
     min_probability: float,
 ) -> GroundSolution:
     coefficient_cov = _coefficient_cov(problem, state)
+    kept = state.copy()
     status = state.status.copy()
     status[(status == GroundStatus.OK) & _behind(places, state.pivot, state.rot, reflectors)] = (
         GroundStatus.BEHIND_REFLECTOR
@@ -352,6 +358,7 @@ def _solution(
     if np.any(np.isnan(coefficient_cov)):
         status[status == GroundStatus.OK] = GroundStatus.SINGULAR
     solved = status == GroundStatus.OK
+    kept.status[~solved] = np.maximum(status[~solved], GroundStatus.NO_START)
     # each mirror pays its share of the coefficients
     dof = problem.dof - np.einsum("mab,ba->m", state.schur, coefficient_cov)
     probability = _probability(state.chi2, dof, solved)
@@ -382,4 +389,7 @@ def _solution(
         probability_direct=probability_direct,
         probability=probability,
         status=status,
+        problem=problem,
+        state=kept,
+        parameter=parameter,
     )

@@ -16,9 +16,11 @@ from rfpose.multilat.integrity.hypotheses import (
     Problem,
     Verdict,
     judge,
+    largest_eigenvalue,
     limit,
     log_probability,
     noncentrality,
+    tilt_quantile,
 )
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, solve_rigid
 
@@ -521,7 +523,7 @@ class _Guard:
         rot = self.poses["rot_enu_from_mirror"][rows]
         turn = -np.einsum("mac,mhc->mha", rot[:, :, :2], verdict.shift_rad)
         normal = rot[:, None, :, 2] + np.cross(turn, rot[:, None, :, 2])
-        sigma = np.sqrt(_largest(verdict.cov_rad2[:, None] + verdict.spread_rad2))
+        sigma = np.sqrt(largest_eigenvalue(verdict.cov_rad2[:, None] + verdict.spread_rad2))
         self.other_normal[rows] = np.where(near[..., None], normal, np.nan)
         self.other_sigma[rows] = np.where(near, sigma, np.nan)
 
@@ -567,12 +569,12 @@ class _Guard:
         """Protection level against one more faulty transmitter."""
         n_transmitter = len(self.problem.transmitter)
         dof = verdict.dof[:, :n_transmitter]
-        spread = np.sqrt(_largest(verdict.spread_rad2[:, :n_transmitter]))
+        spread = np.sqrt(largest_eigenvalue(verdict.spread_rad2[:, :n_transmitter]))
         hidden_bias = np.sqrt(noncentrality(limit(self.single_alarm, dof), dof, self.missed))
         with np.errstate(invalid="ignore"):
             bias = np.where(dof > 0, hidden_bias * spread, 0.0)
         bias[verdict.hidden[:, :n_transmitter]] = np.inf
-        noise = _quantile(self.missed) * np.sqrt(_largest(verdict.cov_rad2))
+        noise = tilt_quantile(self.missed) * np.sqrt(largest_eigenvalue(verdict.cov_rad2))
         self.own_level[rows] = np.where(verdict.ok, bias.max(axis=1) + noise, np.inf)
         self.worst[rows] = np.argmax(bias, axis=1)
 
@@ -604,7 +606,7 @@ class _Guard:
         moot = np.concatenate([self.transmitter_status > TransmitterStatus.NOT_RECEIVED, self.problem.dropped], axis=1)
         normal = self.poses["rot_enu_from_mirror"][:, None, :, 2]
         apart = np.linalg.norm(self.other_normal - normal, axis=-1)
-        level = np.where(moot, np.nan, apart + _quantile(self.missed) * self.other_sigma)
+        level = np.where(moot, np.nan, apart + tilt_quantile(self.missed) * self.other_sigma)
         return np.asarray(np.fmax.reduce(level, axis=1))
 
 
@@ -629,14 +631,3 @@ def _like(rows: BoolArray, array: npt.NDArray[Any]) -> BoolArray:
 
 def _pick(verdict: Verdict, index: IntArray) -> Verdict:
     return Verdict(**{f.name: getattr(verdict, f.name)[index] for f in fields(Verdict)})
-
-
-def _largest(matrix: FloatArray) -> FloatArray:
-    """Larger eigenvalue of symmetric 2×2 matrices."""
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    return np.asarray(0.5 * (a + d) + np.sqrt(0.25 * (a - d) ** 2 + b * b))
-
-
-def _quantile(probability: float) -> float:
-    """How many of its larger sigmas a two-dimensional normal error exceeds with at most ``probability``."""
-    return float(np.sqrt(-2.0 * np.log(probability)))

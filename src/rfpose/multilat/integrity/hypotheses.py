@@ -17,7 +17,17 @@ from rfpose.checks import FloatArray
 from rfpose.multilat.integrity import _kernels
 from rfpose.multilat.rigid import Knowledge, RigidPoses
 
-__all__ = ["PRIORS", "Problem", "Verdict", "judge", "log_probability", "noncentrality"]
+__all__ = [
+    "PRIORS",
+    "Problem",
+    "Verdict",
+    "judge",
+    "largest_eigenvalue",
+    "limit",
+    "log_probability",
+    "noncentrality",
+    "tilt_quantile",
+]
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -260,3 +270,14 @@ def noncentrality(threshold: FloatArray, dof: IntArray, missed: float) -> FloatA
         at = dof == d
         out[at] = chndtrinc(threshold[at][0], float(d), missed)
     return out
+
+
+def largest_eigenvalue(matrix: FloatArray) -> FloatArray:
+    """Larger eigenvalue of symmetric 2×2 matrices."""
+    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
+    return np.asarray(0.5 * (a + d) + np.sqrt(0.25 * (a - d) ** 2 + b * b))
+
+
+def tilt_quantile(probability: float) -> float:
+    """How many of its larger sigmas a two-dimensional normal error exceeds with at most ``probability``."""
+    return float(np.sqrt(-2.0 * np.log(probability)))

@@ -21,6 +21,9 @@ from rfpose.multilat.rigid import _kernels
 
 __all__ = ["LearnedDelays", "learn_delays"]
 
+UNSEEN_M = 10.0
+"""Standard deviation of a difference that nothing has observed yet: 30 ns."""
+
 _JUMP_PROBABILITY = 1e-9
 """Differences rarer than this under prediction and noise mean that a delay has jumped: it is learned anew."""
 
@@ -42,6 +45,8 @@ class LearnedDelays:
         Its covariance.
     jumped : (frame, mirror)
         A delay had jumped; it was learned anew from this frame.
+    unseen_m
+        Standard deviation of differences that nothing has observed yet [m].
     """
 
     pivot_enu_m: FloatArray
@@ -50,6 +55,7 @@ class LearnedDelays:
     difference_m: FloatArray
     difference_cov_m2: FloatArray
     jumped: npt.NDArray[np.bool_]
+    unseen_m: float = UNSEEN_M
 
 
 def learn_delays(
@@ -60,6 +66,7 @@ def learn_delays(
     *,
     time_s: npt.ArrayLike,
     drift_m_per_sqrt_s: float,
+    observed: npt.ArrayLike | None = None,
 ) -> LearnedDelays:
     """Filter the clock differences of many mirrors over frames, and refine each frame's pose by them.
 
@@ -75,6 +82,13 @@ def learn_delays(
         Increasing [s].
     drift_m_per_sqrt_s
         Random-walk rate of each receiver's delay [m/√s]; 1 ps/√min is 3.9e-5.
+    observed : (frame, mirror, class, receiver), optional
+        Which clocks the frame's phases tell of (a carrier without integers tells nothing); default: all.
+
+    Notes
+    -----
+    Walks of one receiver's classes (tones, carrier) may be the same or independent; covariances hold for either,
+    because the walk is taken as large as the number of classes times its rate.
 
     Raises
     ------
@@ -95,7 +109,11 @@ def learn_delays(
         raise InvalidInputError(f"`drift_m_per_sqrt_s` must not be negative, got {drift_m_per_sqrt_s}")
 
     to_difference = np.kron(np.eye(n_class), np.column_stack([-np.ones(n_receiver - 1), np.eye(n_receiver - 1)]))
-    walk = drift_m_per_sqrt_s**2 * to_difference @ to_difference.T
+    walk = n_class * drift_m_per_sqrt_s**2 * to_difference @ to_difference.T
+    seen_clock = np.ones(clock.shape, np.bool_) if observed is None else np.array(observed, np.bool_)
+    if seen_clock.shape != clock.shape:
+        raise InvalidInputError(f"`observed` must have the shape of `clock_m`, {clock.shape}, got {seen_clock.shape}")
+    blind = ~(seen_clock[..., :1] & seen_clock[..., 1:]).reshape(n_frame, n_mirror, -1)
     n_difference = len(to_difference)
     limit = float(chi2.isf(_JUMP_PROBABILITY, n_difference))
     known = np.zeros(n_mirror, np.bool_)
@@ -109,6 +127,10 @@ def learn_delays(
         solved = np.isfinite(whole[f]).all(axis=(1, 2)) & np.isfinite(clock[f]).all(axis=(1, 2))
         measured = clock[f].reshape(n_mirror, -1) @ to_difference.T
         noise = to_difference @ whole[f][:, 6:, 6:] @ to_difference.T
+        # what was not observed is held in the pose's covariance: here it is anything, and correlated with nothing
+        either = blind[f][:, :, None] | blind[f][:, None, :]
+        noise = np.where(either, np.eye(n_difference) * UNSEEN_M**2, noise)
+        measured = np.where(blind[f], state, measured)
         out_cov[f] = whole[f][:, :6, :6]
         predicted = spread + (time[f] - seen_at)[:, None, None] * walk
         both = solved & known
@@ -117,7 +139,7 @@ def learn_delays(
         weighed = np.linalg.solve(total, innovation[..., None])[..., 0]
         jumped[f] = both & (np.sum(innovation * weighed, axis=1) > limit)
         use = both & ~jumped[f]
-        with_pose = whole[f][:, :6, 6:] @ to_difference.T
+        with_pose = np.where(blind[f][:, None], 0.0, whole[f][:, :6, 6:] @ to_difference.T)
         gain = np.linalg.solve(total, np.where(use[:, None, None], with_pose, 0.0).swapaxes(1, 2)).swapaxes(1, 2)
         move = -np.einsum("mad,md->ma", gain, innovation)
         pivot[f, use] += move[use, :3]

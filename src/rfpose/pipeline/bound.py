@@ -1,0 +1,175 @@
+"""The Cramér–Rao bound of mirror normals, for any scenario and any choice of estimator."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.geometry import rot_enu_from_mirror
+from rfpose.multilat import normal_bound
+from rfpose.multilat.ground import ground_bound
+from rfpose.multilat.rigid import full_covariance, tilt_sigma_rad
+from rfpose.multilat.rigid.delays import learn_delays
+from rfpose.pipeline.choice import PoseChoice, reflectors_of
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_share, carrier_rf_hz, group_hz, mirror_groups
+from rfpose.pipeline.noise import PhaseNoise
+from rfpose.scenario import Scenario
+
+__all__ = ["normal_bound_rad"]
+
+
+def normal_bound_rad(
+    scenario: Scenario,
+    choice: PoseChoice,
+    noise: PhaseNoise,
+    *,
+    normal_enu: FloatArray,
+    receiver_enu_m: FloatArray,
+    frame_start_index: npt.NDArray[np.int64],
+    sample_rate: Fraction,
+    coefficient: FloatArray | None = None,
+) -> FloatArray:
+    """Bound of the angle of each mirror's normal, both axes together (frame, heliostat) [rad].
+
+    All wavelengths count as resolved and no transmitter as left out. Learned delays count what all frames up to each
+    one tell; estimated coefficients what all mirrors that share them tell.
+
+    Parameters
+    ----------
+    scenario
+        Clocks, priors, reflecting planes.
+    choice
+        The estimator.
+    noise
+        Of every phase.
+    normal_enu : (frame, heliostat, xyz)
+        True normals.
+    receiver_enu_m : (frame, receiver, xyz)
+        True places, for pose ``independent`` [m].
+    frame_start_index : (frame,)
+        First sample of each frame.
+    sample_rate
+        [1/s].
+    coefficient : (reflector,), optional
+        True reflection coefficients, complex; needed where ``choice`` has any.
+    """
+    if choice.pose != "rigid":
+        return _independent(scenario, noise, receiver_enu_m)
+    start = frame_start_index
+    time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
+    out = np.full(normal_enu.shape[:2], np.nan)
+    for group in mirror_groups(scenario):
+        rot = rot_enu_from_mirror(normal_enu[:, group.column].reshape(-1, 3))
+        cov = _rigid(scenario, choice, noise, group, rot, coefficient)
+        if group.learns_delays:
+            cov = _learned(scenario, group, rot, cov, time_s)
+        out[:, group.column] = tilt_sigma_rad(cov[:, :6, :6], rot[:, :, 2]).reshape(len(start), -1)
+    return out
+
+
+def _independent(scenario: Scenario, noise: PhaseNoise, receiver_enu_m: FloatArray) -> FloatArray:
+    bound = np.full((len(receiver_enu_m), len(scenario.heliostat)), np.nan)
+    received = np.isfinite(noise.own_m) & np.isfinite(noise.calibration_m)
+    own_m, calibration_m = (np.where(received, a, np.nan) for a in (noise.own_m, noise.calibration_m))
+    for i, heliostat in enumerate(scenario.heliostat):
+        rows = scenario.receiver_rows(i)
+        bound[:, i] = normal_bound(
+            scenario.transmitter_enu_m,
+            receiver_enu_m[:, rows],
+            own_m[:, rows],
+            calibration_m[:, rows],
+            receiver_mirror_m=heliostat.receiver_mirror_m,
+        ).sigma_rad
+    return bound
+
+
+def _rigid(
+    scenario: Scenario,
+    choice: PoseChoice,
+    noise: PhaseNoise,
+    group: MirrorGroup,
+    rot: FloatArray,
+    coefficient: FloatArray | None,
+) -> FloatArray:
+    """Covariance of pose and clocks of a group's mirrors, first axis frame × heliostat."""
+    n_frame = len(noise.tone_rad)
+    sigma, common = _range_noise(scenario, noise, group)
+    places = np.tile(group.places_m, (n_frame, 1, 1))
+    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
+    known = group.knowledge(scenario, n_frame)
+    classes = np.arange(sigma.shape[1])
+    if choice.reflection == "none":
+        return full_covariance(
+            scenario.transmitter_enu_m,
+            places,
+            pivot,
+            rot,
+            sigma_m=sigma,
+            transmitter_sigma_m=common,
+            clock_class=classes,
+            knowledge=known,
+        )
+    reflectors = reflectors_of(scenario, choice.reflection)
+    truth = np.zeros(len(reflectors), np.complex128) if coefficient is None else np.asarray(coefficient)
+    row = np.arange(len(rot)).reshape(n_frame, -1)
+    shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
+    out = np.full((len(rot), *2 * (6 + sigma.shape[1] * sigma.shape[2],)), np.nan)
+    for rows in shared:
+        out[rows] = ground_bound(
+            scenario.transmitter_enu_m,
+            places[rows],
+            pivot[rows],
+            rot[rows],
+            sigma_m=sigma[rows],
+            transmitter_sigma_m=common[rows],
+            clock_class=classes,
+            carrier_rf_hz=carrier_rf_hz(scenario),
+            tone_hz=group_hz(scenario, group),
+            reflectors=reflectors,
+            coefficient=[complex(c) for c in truth],
+            calibration_enu_m=scenario.calibration_enu_m,
+            calibration_share=calibration_share(noise.tone_rad, scenario),
+            knowledge=known,
+            free_space=scenario.reflection.spreading == "free_space",
+            propagation_speed_mps=scenario.radio.propagation_speed_mps,
+        )
+    return out
+
+
+def _range_noise(scenario: Scenario, noise: PhaseNoise, group: MirrorGroup) -> tuple[FloatArray, FloatArray]:
+    """Sigma of ranges (mirror, wavelength, receiver, transmitter), and of transmitters (mirror, wavelength, …) [m]."""
+    n = len(noise.tone_rad) * len(group.column)
+    sigma, common = [], []
+    for q in np.argsort(-scenario.wavelength_m):
+        to_m = scenario.wavelength_m[q] / (2.0 * np.pi)
+        sigma.append(to_m * noise.tone_rad[..., q][:, group.rows].reshape(n, group.rows.shape[1], -1))
+        common.append(to_m * np.repeat(noise.calibration_rad[..., q], len(group.column), axis=0))
+    if group.uses_carrier:
+        to_m = scenario.radio.propagation_speed_mps / carrier_rf_hz(scenario) / (2.0 * np.pi)
+        sigma.append(to_m * noise.carrier_rad[:, group.rows].reshape(n, group.rows.shape[1], -1))
+        common.append(np.full((n, len(scenario.transmitter)), np.inf))
+    return np.stack(sigma, axis=1), np.stack(common, axis=1)
+
+
+def _learned(
+    scenario: Scenario, group: MirrorGroup, rot: FloatArray, cov: FloatArray, time_s: FloatArray
+) -> FloatArray:
+    """Let earlier frames' delays count: the filter's own covariances, at the true poses."""
+    n_frame, n_helio, n_receiver = len(time_s), len(group.column), group.rows.shape[1]
+    n_class = (cov.shape[1] - 6) // n_receiver
+
+    def by_frame(array: FloatArray) -> FloatArray:
+        return array.reshape(n_frame, n_helio, *array.shape[1:])
+
+    learned = learn_delays(
+        by_frame(np.tile(group.pivot_enu_m, (n_frame, 1))),
+        by_frame(rot),
+        np.zeros((n_frame, n_helio, n_class, n_receiver)),
+        by_frame(cov),
+        time_s=time_s,
+        drift_m_per_sqrt_s=group.drift_m_per_sqrt_s(scenario),
+    )
+    return learned.cov.reshape(-1, 6, 6)

@@ -1,0 +1,190 @@
+"""A recording's mirrors as arrays for the rigid solvers: which phases, clocks and priors go in, by the scenario."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.dsp import Calibration, TonePhases
+from rfpose.multilat import RangeDifferences
+from rfpose.multilat.rigid import Knowledge
+from rfpose.multilat.rigid.integers import Observation
+from rfpose.scenario import Heliostat, Scenario
+
+__all__ = ["MirrorGroup", "calibration_share", "carrier_rf_hz", "group_hz", "mirror_groups", "observations"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MirrorGroup:
+    """Heliostats that differ in nothing but place: solved in one call.
+
+    Attributes
+    ----------
+    column : (heliostat,)
+    rows : (heliostat, receiver)
+        Of the receiver axis.
+    places_m : (heliostat, receiver, xyz)
+        From the pivot, in the mirror frame [m].
+    pivot_enu_m : (heliostat, xyz)
+        [m].
+    kind
+        The first of them.
+    """
+
+    column: npt.NDArray[np.int64]
+    rows: npt.NDArray[np.int64]
+    places_m: FloatArray
+    pivot_enu_m: FloatArray
+    kind: Heliostat
+
+    @property
+    def uses_carrier(self) -> bool:
+        """Whether carriers can be compared between the receivers: only on one oscillator do their phases cancel."""
+        return self.kind.oscillator == "shared" and self.kind.carrier_phase
+
+    @property
+    def learns_delays(self) -> bool:
+        """Whether delays between receivers are learned over frames."""
+        return self.kind.receiver_delay_drift_s_per_sqrt_min is not None
+
+    def knowledge(self, scenario: Scenario, n_frame: int) -> Knowledge:
+        """Return what the scenario knows of these mirrors, one row a frame and heliostat."""
+        kind = self.kind
+        delay = kind.receiver_delay_sigma_s
+        shared = kind.oscillator == "shared" and delay is not None
+        return Knowledge(
+            clock_sigma_m=float(delay or 0.0) * scenario.radio.propagation_speed_mps if shared else np.inf,
+            pivot_enu_m=np.tile(self.pivot_enu_m, (n_frame, 1)) if kind.pivot_sigma_m is not None else None,
+            pivot_sigma_m=np.inf if kind.pivot_sigma_m is None else kind.pivot_sigma_m,
+            two_axis=kind.mount == "azimuth_elevation",
+        )
+
+    def drift_m_per_sqrt_s(self, scenario: Scenario) -> float:
+        """Random-walk rate of the delays [m/√s]."""
+        rate = self.kind.receiver_delay_drift_s_per_sqrt_min or 0.0
+        return rate / math.sqrt(60.0) * scenario.radio.propagation_speed_mps
+
+
+def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
+    """Sort heliostats by number of receivers and by what is known of them."""
+    kinds: dict[tuple[object, ...], list[int]] = {}
+    for i, h in enumerate(scenario.heliostat):
+        key = (
+            len(h.receiver_ids),
+            h.oscillator,
+            h.receiver_delay_sigma_s,
+            h.receiver_delay_drift_s_per_sqrt_min,
+            h.pivot_sigma_m,
+            h.mount,
+            h.carrier_phase,
+        )
+        kinds.setdefault(key, []).append(i)
+    for members in kinds.values():
+        helio = [scenario.heliostat[i] for i in members]
+        arm = np.array([[0.0, 0.0, h.arm_m] for h in helio])
+        yield MirrorGroup(
+            column=np.array(members),
+            rows=np.array([np.arange(len(scenario.receivers))[scenario.receiver_rows(i)] for i in members]),
+            places_m=np.array([h.receiver_mirror_m for h in helio]) + arm[:, None],
+            pivot_enu_m=scenario.pivot_enu_m[members],
+            kind=helio[0],
+        )
+
+
+def carrier_rf_hz(scenario: Scenario) -> FloatArray:
+    """(transmitter,) carrier frequencies at RF [Hz]."""
+    return np.asarray(scenario.radio.centre_frequency_hz + scenario.carrier_hz)
+
+
+def group_hz(scenario: Scenario, group: MirrorGroup) -> FloatArray:
+    """(wavelength,) tones as `observations` orders them [Hz]; zero stands for the carrier."""
+    tones = scenario.tone_hz[np.argsort(-scenario.wavelength_m)]
+    return np.append(tones, 0.0) if group.uses_carrier else tones
+
+
+def observations(
+    tones: TonePhases, calibration: Calibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
+) -> list[Observation]:
+    """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat."""
+    n_frame, n_helio = len(tones.frame_start_index), len(group.column)
+    n_receiver, n_transmitter = group.rows.shape[1], len(scenario.transmitter)
+
+    def of_mirrors(values: npt.NDArray[np.float64]) -> FloatArray:
+        return values[:, group.rows].reshape(n_frame * n_helio, n_receiver, *values.shape[2:])
+
+    out = []
+    for k, q in enumerate(np.argsort(-scenario.wavelength_m)):
+        wavelength = float(scenario.wavelength_m[q])
+        to_m = wavelength / (2.0 * np.pi)
+        z = of_mirrors(-to_m * (tones.phase_rad[..., q] - calibration.phase_rad[:, None, :, q]))
+        if k == 0:
+            z = _coarse(
+                z, of_mirrors(ranges.range_difference_m), of_mirrors(ranges.reference.astype(np.float64)), wavelength
+            )
+        per_frame = to_m * np.repeat(calibration.sigma_rad[..., q], n_helio, axis=0)
+        out.append(
+            Observation(
+                range_m=z,
+                sigma_m=of_mirrors(to_m * tones.sigma_rad[..., q]),
+                transmitter_sigma_m=per_frame,
+                wavelength_m=np.full(n_transmitter, wavelength),
+                clock_class=k,
+            )
+        )
+    if group.uses_carrier:
+        carrier_m = scenario.radio.propagation_speed_mps / carrier_rf_hz(scenario)
+        to_m_each = carrier_m / (2.0 * np.pi)
+        seen = np.isfinite(tones.phase_rad[..., 0])
+        phase = np.where(seen, np.angle(tones.carrier), np.nan)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sigma = tones.carrier_sigma / np.abs(tones.carrier)
+        out.append(
+            Observation(
+                range_m=of_mirrors(-to_m_each * phase),
+                sigma_m=of_mirrors(to_m_each * sigma),
+                transmitter_sigma_m=np.full((n_frame * n_helio, n_transmitter), np.inf),
+                wavelength_m=carrier_m,
+                clock_class=len(out),
+            )
+        )
+    return out
+
+
+def _coarse(z: FloatArray, difference_m: FloatArray, reference: FloatArray, wavelength: float) -> FloatArray:
+    """Give the coarsest tone's ranges the whole wavelengths that the range differences know.
+
+    A row's reference range keeps its own noise; the rows of a mirror are brought within half a wavelength of each
+    other, as near as its receivers are.
+    """
+    index = np.maximum(reference.astype(np.int64), 0)[..., None]
+    base = np.take_along_axis(z, index, axis=-1)
+    first = np.nan_to_num(np.take_along_axis(base, np.argmax(np.isfinite(base), axis=1)[:, None], axis=1))
+    base = base - wavelength * np.rint((base - first) / wavelength)
+    expected = base + difference_m
+    return z + wavelength * np.rint((expected - z) / wavelength)
+
+
+def calibration_share(sigma_rad: FloatArray, scenario: Scenario) -> FloatArray:
+    """Return each calibration receiver's share of the mean that electronic phases are (calibration, transmitter).
+
+    Parameters
+    ----------
+    sigma_rad : (frame, receiver, transmitter, tone)
+        Of the tones; shares are averaged over frames and tones.
+    scenario
+        Its surveys count.
+    """
+    is_calibration = np.array([r.calibration is not None for r in scenario.receivers], bool)
+    survey = np.array([r.survey_sigma_m for r in scenario.calibration_receiver])
+    wavenumber = 2.0 * np.pi / scenario.wavelength_m
+    variance = sigma_rad[:, is_calibration] ** 2 + (survey[:, None, None] * wavenumber) ** 2
+    weight = np.where(np.isfinite(variance), 1.0 / np.where(np.isfinite(variance), variance, 1.0), 0.0)
+    share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
+    mean = share.mean(axis=(0, 3))
+    total = mean.sum(axis=0, keepdims=True)
+    return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 1.0 / len(mean)))
