@@ -43,7 +43,9 @@ CRITERIA: dict[str, int] = {
 Progress = Callable[[int, int], None]
 
 _DRAWS = 2000
-"""Random places tried for a tower before the constraints count as impossible."""
+"""Random places tried for a tower before another attempt begins."""
+_ATTEMPTS = 20
+"""Attempts to place all towers before the constraints count as impossible."""
 _WORST_POWER = 12.0
 _BAND = 0.02
 """Width of the ranks that stand for a percentile while searching, so that it has a slope."""
@@ -223,6 +225,18 @@ class _Problem:
         value, weight = _statistic(variance, self.statistic, smooth=True)
         gradient = np.einsum("p,pta->ta", weight, slope)[len(self.existing) :]
         return float(np.log(value)), self.scale * gradient.ravel() / value
+
+    def is_free(self, ground: FloatArray, others: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which places (place, xy) a tower may take beside others (tower, xy)."""
+        rules = self.constraints
+        free: npt.NDArray[np.bool_] = np.any([zone.depth(ground)[0] >= 0.0 for zone in rules.allowed], axis=0)
+        for zone in rules.excluded:
+            free &= zone.depth(ground)[0] <= 0.0
+        if self.heliostats is not None:
+            free &= np.asarray(self.heliostats.query(ground)[0]) >= rules.clearance_m
+        for other in others if rules.separation_m > 0.0 else ():
+            free &= np.hypot(*(ground - other).T) >= rules.separation_m
+        return free
 
     def margins(self, x: FloatArray) -> FloatArray:
         return self._margins(x)[0]
@@ -457,18 +471,22 @@ def _draw(problem: _Problem, n_new: int, rng: np.random.Generator) -> FloatArray
     rules = problem.constraints
     boxes = np.array([zone.box for zone in rules.allowed])
     area = np.prod(boxes[:, 1] - boxes[:, 0], axis=1)
-    for _ in range(20):
+    most = 0
+    for _ in range(_ATTEMPTS):
         placed = np.empty((0, 3))
-        for _ in range(_DRAWS):
-            low, high = boxes[rng.choice(len(boxes), p=area / area.sum())]
-            place = np.append(rng.uniform(low, high), rng.uniform(*rules.height_m))
-            trial = np.vstack([placed, place])
-            if np.all(problem.margins(trial.ravel() / problem.scale) >= 0.0):
-                placed = trial
-                if len(placed) == n_new:
-                    return placed
+        while len(placed) < n_new:
+            which = rng.choice(len(boxes), size=_DRAWS, p=area / area.sum())
+            ground = rng.uniform(boxes[which, 0], boxes[which, 1])
+            height = rng.uniform(*rules.height_m, size=_DRAWS)
+            free = np.flatnonzero(problem.is_free(ground, np.vstack([problem.existing, placed])[:, :2]))
+            if not free.size:
+                break
+            placed = np.vstack([placed, np.append(ground[free[0]], height[free[0]])])
+        if len(placed) == n_new:
+            return placed
+        most = max(most, len(placed))
     raise GeometryError(
-        f"the constraints leave no room for {n_new} new transmitters ({len(placed)} found places); relax the "
+        f"the constraints leave no room for {n_new} new transmitters ({most} found places); relax the "
         f"separation of {rules.separation_m:g} m, the clearance, or the zones"
     )
 

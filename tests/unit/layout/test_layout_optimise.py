@@ -81,11 +81,30 @@ def test_more_transmitters_are_dearer_and_better():
     [
         (Constraints(allowed=(Zone(radius_m=1.0),), height_m=(0.2, 0.5), separation_m=1.5), 10, GeometryError, "room"),
         (DISC, 4, GeometryError, "at least 5"),
+        (
+            Constraints(allowed=(Zone(radius_m=1.0),), excluded=(Zone(radius_m=1.1),), height_m=(0.2, 0.5)),
+            6,
+            GeometryError,
+            "room",
+        ),
+        (
+            Constraints(allowed=(Zone(radius_m=0.5),), height_m=(0.2, 0.5), clearance_m=0.5),
+            6,
+            GeometryError,
+            "room",
+        ),
     ],
 )
 def test_what_cannot_be_met_is_refused(rules, n, error, text):
     with pytest.raises(error, match=text):
         optimise(n, FIELD, rules, starts=1)
+
+
+def test_heights_the_wrong_way_round_are_refused():
+    with pytest.raises(InvalidInputError, match=r"lowest, highest"):
+        Constraints(allowed=(Zone(radius_m=1.0),), height_m=(0.5, 0.2))
+    with pytest.raises(GeometryError, match="exist already"):
+        optimise(5, FIELD, DISC, existing_enu_m=np.column_stack([disc_points(5)[:, :2], np.full(5, 0.3)]), starts=1)
 
 
 def test_unknown_statistic_is_refused():
