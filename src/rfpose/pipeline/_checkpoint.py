@@ -70,9 +70,9 @@ class Checkpoint:
             )
         return arrays
 
-    def write(self, state: Mapping[str, npt.NDArray[Any]], *, now: bool = False) -> None:
+    def write(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Keep a state, if the last one was kept long enough ago."""
-        if not now and time.monotonic() - self._last < self._interval_s:
+        if time.monotonic() - self._last < self._interval_s:
             return
         buffer = io.BytesIO()
         np.savez(buffer, **{**state, _KEY: np.array(json.dumps(self._key, sort_keys=True))})  # type: ignore[arg-type]

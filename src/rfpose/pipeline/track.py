@@ -28,6 +28,7 @@ def track(
     heliostats: int | None = None,
     seed: int = 0,
     force: bool = False,
+    checkpoint_s: float = 20.0,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Track:
     """Track a scenario's field by several methods and write what came of it.
@@ -49,6 +50,8 @@ def track(
         Same scenario and seed, same result.
     force
         Overwrite an existing file, and discard unfinished work.
+    checkpoint_s
+        Least time between two states kept [s].
     on_progress
         Called with (stretches of time done, stretches in all).
 
@@ -73,15 +76,16 @@ def track(
         "heliostats": str(len(simulation.field)),
     }
     key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
-    checkpoint = Checkpoint(result_path.with_name(f".{result_path.name}.state"), key, restart=force)
+    place = result_path.with_name(f".{result_path.name}.state")
+    checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
     state = checkpoint.read()
     if state is not None:
         simulation.restore(state)
     while simulation.done < simulation.n_segment:
         simulation.advance()
+        checkpoint.write(simulation.state())
         if on_progress is not None:
             on_progress(simulation.done, simulation.n_segment)
-        checkpoint.write(simulation.state())
     found = track_of(simulation, settings)
     write_track(found, result_path)
     checkpoint.remove()

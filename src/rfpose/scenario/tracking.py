@@ -111,6 +111,8 @@ class Camera(Record):
     """Constant error of a mirror's normal from the target's survey and the camera's rectification."""
     interval_days: Positive = 90.0
     """Between two calibration days of a mirror."""
+    worm: bool = False
+    """Whether the fitted model also has the worm gears' periodic error."""
     points_per_day: Annotated[int, Field(ge=1)] = 16
     bias_interval_days: Positive = 1.0
     """Between two looks at a mirror for method ``bias``."""
@@ -123,7 +125,8 @@ class Camera(Record):
 class Drone(Record):
     """Calibration by drone (Gouws)."""
 
-    normal_sigma_mrad: NonNegative = 0.15
+    distance_m: Positive = 32.0
+    """From the mirror to the drone; the noise is that of Gouws' GPS seen from there."""
     constant_sigma_mrad: NonNegative = 0.05
     interval_days: Positive = 30.0
     points: Annotated[int, Field(ge=4)] = 20

@@ -99,7 +99,7 @@ def field_positions(scenario: Scenario, count: int | None) -> tuple[tuple[str, .
 
 
 def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: FloatArray) -> Field:
-    """Draw the mirrors of a run; azimuth axes have the middle of their travel on the sun's course ``sun_enu`` (time, xyz).
+    """Draw the mirrors of a run; azimuth axes have the middle of their travel on the course ``sun_enu`` (time, xyz).
 
     Raises
     ------

@@ -16,6 +16,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibration import PARAMETER_SETS, FitSettings, solve
+from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.mount import PARAMETERS, aim_rows
 from rfpose.feedback.optics import reflect
 from rfpose.feedback.sun import Site, sun_position
@@ -42,11 +43,12 @@ _PRIORS = {
     "location_north_m": (0.0, 0.05),
     "location_up_m": (0.0, 0.05),
     "gravity_sag_rad": (0.0, 1e-3),
-    "worm_1_sin_rad": (0.0, 1e-3),
-    "worm_1_cos_rad": (0.0, 1e-3),
-    "worm_2_sin_rad": (0.0, 1e-3),
-    "worm_2_cos_rad": (0.0, 1e-3),
+    "worm_1_sin_rad": (0.0, 2e-3),
+    "worm_1_cos_rad": (0.0, 2e-3),
+    "worm_2_sin_rad": (0.0, 2e-3),
+    "worm_2_cos_rad": (0.0, 2e-3),
 }
+_WORMS = ("worm_1_sin_rad", "worm_1_cos_rad", "worm_2_sin_rad", "worm_2_cos_rad")
 _LARGE = (0.0, 0.03)
 _STEEP = 0.3
 
@@ -128,7 +130,7 @@ class Workshop:
     def _times(self, since_first: int, n: int, *, scatter: np.random.Generator | None = None) -> FloatArray:
         """Instants of a day's sunshine: evenly spread, or drawn."""
         date = self._scenario.tracking.date + datetime.timedelta(days=since_first)
-        unix_s = day_of(self._scenario, date, since_first).unix_s
+        unix_s = day_of(self._scenario, date, since_first, whole=True).unix_s
         if scatter is not None:
             return np.sort(scatter.uniform(unix_s[0], unix_s[-1], n))
         return np.linspace(unix_s[0], unix_s[-1], n + 2)[1:-1]
@@ -214,15 +216,21 @@ class Workshop:
         rows = aim_rows(np.broadcast_to(look.sun_enu, spot.shape), spot, source_is_point=False, target_is_point=True)
         # the model's own faults scatter as well: wind, gears, steps
         rows[..., 8] = np.hypot(sigma, self._scatter_rad())
-        return self._fit(start, look, rows, PARAMETER_SETS["malan"], np.isfinite(beam[..., 0]))
+        free = PARAMETER_SETS["malan"] + (_WORMS if camera.worm else ())
+        return self._fit(start, look, rows, free, np.isfinite(beam[..., 0]))
 
     def _drone_fit(self, start: FloatArray, since_first: int) -> FloatArray:
         rng = generator(self._seed, 21, since_first + 100_000)
         drone = self._scenario.tracking.drone
         unix_s = self._times(since_first, drone.points)
         look = self._look(start, unix_s, since_first, rng, self._field.target[:, :3])
-        sigma = 1e-3 * drone.normal_sigma_mrad
-        error = sigma * rng.standard_normal((*look.count.shape[:2], 2)) + self._field.drone_bias_rad[:, None]
+        sigma = drone_sigma_rad(
+            look.centre_enu_m + drone.distance_m * look.sun_enu,
+            look.centre_enu_m,
+            target_enu_m=np.broadcast_to(self._field.target[:, None, :3], look.centre_enu_m.shape),
+        )
+        noise = rng.standard_normal((*look.count.shape[:2], 2))
+        error = sigma[..., None] * noise + self._field.drone_bias_rad[:, None]
         normal = look.tilted(error)
         rows = aim_rows(normal, normal, source_is_point=False, target_is_point=False)
         rows[..., 8] = np.hypot(sigma, self._scatter_rad())

@@ -65,6 +65,8 @@ class RadioModel:
         Transmitters, tones, receivers, clocks; ``[tracking.radio]`` for what the loop does with them.
     pivot_enu_m : (mirror, xyz)
         Where the mirrors stand [m]. All carry the receivers of the scenario's first heliostat.
+    usual_normal_enu : (mirror, xyz)
+        Postures in which to find out what estimating a reflection costs.
 
     Raises
     ------
@@ -74,7 +76,7 @@ class RadioModel:
         Transmitters that fix no position.
     """
 
-    def __init__(self, scenario: Scenario, pivot_enu_m: FloatArray) -> None:
+    def __init__(self, scenario: Scenario, pivot_enu_m: FloatArray, *, usual_normal_enu: FloatArray) -> None:
         if not scenario.heliostat:
             raise ScenarioError("no [[heliostat]] says where receivers are on a mirror; add one, or leave radio out")
         check_transmitters(scenario.transmitter_enu_m)
@@ -85,8 +87,11 @@ class RadioModel:
         self._noise: Noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
         ground = scenario.simulation.ground
         self._handling = "none" if ground is None else scenario.tracking.radio.ground
-        self._excess: float | None = None
         self._nearest = self._neighbours()
+        self.excess = 1.0
+        """How much larger the noise is for estimating the reflection too."""
+        if self._handling == "estimated":
+            self.excess = self._estimation_excess(geometry.rot_enu_from_mirror(usual_normal_enu))
 
     def errors(self, normal_enu: FloatArray, rng: np.random.Generator) -> RadioErrors:
         """Return the errors of poses with these normals; ``rng`` draws which transmitters are hidden.
@@ -113,9 +118,8 @@ class RadioModel:
         cross = np.where(solved, ru, 0.0) / first
         spread = np.stack([first, cross, np.sqrt(np.maximum(np.where(solved, uu, 1.0) - cross**2, 0.0))], axis=1)
         bias = np.zeros((len(rot), 2))
-        if self._handling == "estimated":
-            spread *= self._estimation_excess(rot)
-        elif self._handling == "ignored":
+        spread *= self.excess
+        if self._handling == "ignored":
             bias = self._bias_if_ignored(rot)
         spread[~solved] = 0.0
         return RadioErrors(spread_rad=spread, bias_rad=bias, solved=solved)
@@ -262,19 +266,18 @@ class RadioModel:
         return found.poses.normal_enu, found.poses.cov[:, 3:, 3:]
 
     def _estimation_excess(self, rot: FloatArray) -> float:
-        """How much larger the noise is for estimating the reflection too; found once."""
-        if self._excess is None:
-            _, turn = self._solve(rot, estimate=True)
-            alone = RadioModel._covariance(self, rot, np.zeros((len(rot), 1, 1, 1), np.bool_))[self._nearest[0]]
-            both = np.isfinite(turn[:, 0, 0]) & np.isfinite(alone[:, 0, 0])
-            if not both.any():
-                raise ScenarioError(
-                    "the ground reflection cannot be estimated with these poses: give pivots (`pivot_sigma_m`), a "
-                    'longer frame or a finer tone, or set [tracking.radio] ground = "ignored" to see what that does'
-                )
-            ratio = np.trace(turn[both], axis1=1, axis2=2) / np.trace(alone[both], axis1=1, axis2=2)
-            self._excess = float(np.sqrt(np.median(ratio)))
-        return self._excess
+        """Return the ratio of the noise with the reflection estimated to that without one."""
+        sample = self._nearest[0]
+        _, turn = self._solve(rot, estimate=True)
+        alone = self._covariance(rot, np.zeros((len(rot), 1, 1, 1), np.bool_))[sample]
+        both = np.isfinite(turn[:, 0, 0]) & np.isfinite(alone[:, 0, 0])
+        if not both.any():
+            raise ScenarioError(
+                "the ground reflection cannot be estimated with these poses: give pivots (`pivot_sigma_m`), a longer "
+                'frame or a finer tone, or set [tracking.radio] ground = "ignored" to see what that does'
+            )
+        ratio = np.trace(turn[both], axis1=1, axis2=2) / np.trace(alone[both], axis1=1, axis2=2)
+        return float(np.sqrt(np.median(ratio)))
 
     def _bias_if_ignored(self, rot: FloatArray) -> FloatArray:
         """(mirror, 2) what the reflection does to normals that are solved without it [rad]."""

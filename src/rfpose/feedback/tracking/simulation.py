@@ -151,7 +151,10 @@ class Simulation:
         self.gusts = Gusts(scenario)
         needs_radio = any(m.radio for m in self.methods)
         self.margins: Margins | None = check_gains(scenario) if needs_radio else None
-        self.radio = RadioModel(scenario, self.field.pivot_enu_m) if needs_radio else None
+        self.radio = None
+        if needs_radio:
+            usual = self._wanted_normal(self.days[0], int(np.argmax(self.days[0].sun_enu[:, 2])))
+            self.radio = RadioModel(scenario, self.field.pivot_enu_m, usual_normal_enu=usual)
         self._workshop = Workshop(scenario, self.field, self.radio, self.gusts, seed=self.seed)
         self._stride = round(plan.store_interval_s / plan.servo_interval_s)
         self.segments = self._segments()

@@ -102,17 +102,18 @@ def days(scenario: Scenario) -> tuple[Day, ...]:
     )
 
 
-def day_of(scenario: Scenario, date: datetime.date, since_first: int) -> Day:
-    """Return one day; see `days`."""
+def day_of(scenario: Scenario, date: datetime.date, since_first: int, *, whole: bool = False) -> Day:
+    """Return one day, or the whole of it whatever the hours within which the field tracks; see `days`."""
     plan, site = scenario.tracking, site_of(scenario)
+    first_hour, last_hour = (0.0, 24.0) if whole else (plan.first_hour, plan.last_hour)
     midnight = datetime.datetime(date.year, date.month, date.day, tzinfo=datetime.UTC).timestamp()
     midnight -= np.rad2deg(site.longitude_rad) / 15.0 * 3600.0
-    coarse = midnight + np.arange(plan.first_hour * 3600.0, plan.last_hour * 3600.0, _COARSE_S)
+    coarse = midnight + np.arange(first_hour * 3600.0, last_hour * 3600.0, _COARSE_S)
     up = sun_position(coarse, site).elevation_rad > np.deg2rad(plan.min_sun_elevation_deg)
     if not up.any():
         raise ScenarioError(
             f"[tracking] on {date} the sun is never above {plan.min_sun_elevation_deg:g} degrees between hours "
-            f"{plan.first_hour:g} and {plan.last_hour:g} at latitude {np.rad2deg(site.latitude_rad):.2f}; choose "
+            f"{first_hour:g} and {last_hour:g} at latitude {np.rad2deg(site.latitude_rad):.2f}; choose "
             "another `date`, hours, or a lower `min_sun_elevation_deg`"
         )
     begin, end = np.ceil(coarse[up][0]), coarse[up][-1]

@@ -1,0 +1,268 @@
+"""Parts of the tracking simulation: margins, days, hidden mounts, gusts, radio errors, quantiles."""
+
+import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfpose import geometry
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback.mount import PARAMETERS, Mount, command
+from rfpose.feedback.sun import sun_position
+from rfpose.feedback.tracking import METHODS, _kernels
+from rfpose.feedback.tracking.hidden import draw_field, field_positions, generator
+from rfpose.feedback.tracking.loops import check_gains, loop_margins
+from rfpose.feedback.tracking.methods import choose
+from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.score import quantile
+from rfpose.feedback.tracking.timeline import beam_w_per_m2, days, site_of
+from rfpose.feedback.tracking.wind import Gusts
+from rfpose.layout.maps import ESTIMATORS, Estimator, mirrors_facing, noise_of, normal_map
+from rfpose.scenario import load_scenario, parse_scenario
+
+ROOT = Path(__file__).resolve().parents[3]
+DATA = ROOT / "data" / "tracking_100m.toml"
+
+
+def changed(**tracking):
+    """The shipped scenario with keys of [tracking] replaced."""
+    scenario = load_scenario(DATA)
+    data = scenario.model_dump(exclude_none=True)
+    for key, value in tracking.items():
+        old = data["tracking"].get(key)
+        data["tracking"][key] = {**old, **value} if isinstance(old, dict) else value
+    return type(scenario).model_validate(data)
+
+
+# ---- margins ------------------------------------------------------------------------------------------------------
+
+
+def oscillates(gain, integral, interval, latency):
+    """Whether the sampled loop grows, by running it: a motor that goes where it is told."""
+    shift = ramp = 0.0
+    seen = [1.0] * (max(int(np.ceil(latency / interval)), 1))
+    peak = []
+    for _ in range(4000):
+        error = seen.pop(0)
+        ramp += integral * interval * error
+        shift += interval * (gain * error + ramp)
+        seen.append(1.0 - shift)
+        peak.append(abs(1.0 - shift))
+        if peak[-1] > 1e6:
+            return True
+    return max(peak[-100:]) > 10.0 * max(peak[:100])
+
+
+@pytest.mark.parametrize(("gain", "integral"), [(0.06, 0.0), (0.06, 0.0004), (0.1, 0.002)])
+@pytest.mark.parametrize(("interval", "latency"), [(1.0, 1.0), (4.0, 1.0), (4.0, 9.0)])
+def test_gain_margin_is_where_the_loop_begins_to_grow(gain, integral, interval, latency):
+    margin = loop_margins(gain, integral, interval_s=interval, latency_s=latency).gain
+    assert not oscillates(0.97 * margin * gain, 0.97 * margin * integral, interval, latency)
+    assert oscillates(1.03 * margin * gain, 1.03 * margin * integral, interval, latency)
+
+
+def test_margins_of_a_pure_integrator():
+    # L = K T / (z − 1): grows from K T = 2 on; unity gain at |z − 1| = K T
+    margins = loop_margins(0.05, 0.0, interval_s=4.0, latency_s=0.0)
+    assert margins.gain == pytest.approx(10.0, rel=1e-3)
+    assert margins.bandwidth_hz == pytest.approx(2.0 * np.arcsin(0.1) / (2.0 * np.pi * 4.0), rel=1e-3)
+    assert loop_margins(0.05, 0.0, interval_s=4.0, latency_s=9.0).gain < margins.gain
+
+
+def test_gains_without_margin_are_refused_unless_forced():
+    assert check_gains(load_scenario(DATA)).gain > 1.5
+    hot = changed(radio={"gain_per_s": 0.4})
+    with pytest.raises(InvalidInputError, match=r"gain margin of 1\.2.*force_gains"):
+        check_gains(hot)
+    assert check_gains(changed(radio={"gain_per_s": 0.4, "force_gains": True})).gain < 1.5
+
+
+# ---- days ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_day_lasts_while_the_sun_is_high_enough():
+    scenario = load_scenario(DATA)
+    (day,) = days(scenario)
+    sun = sun_position(day.unix_s[::600], site_of(scenario))
+    np.testing.assert_allclose(day.sun_enu[: len(day.unix_s) : 600], sun.direction_enu, atol=2e-7)
+    assert np.rad2deg(sun.elevation_rad.min()) == pytest.approx(10.0, abs=0.2)
+    assert np.rad2deg(sun_position([day.unix_s[0] - 60.0], site_of(scenario)).elevation_rad[0]) < 10.0
+    assert day.hour[0] < 7.0 < 17.0 < day.hour[-1]
+    assert len(day.unix_s) % 4 == 0
+
+
+def test_sun_below_the_horizon_is_refused():
+    polar = load_scenario(DATA).model_copy(update={"site": load_scenario(DATA).site.model_copy(
+        update={"latitude_deg": 78.0})})  # fmt: skip
+    winter = polar.model_copy(update={"tracking": polar.tracking.model_copy(
+        update={"date": datetime.date(2026, 12, 21)})})  # fmt: skip
+    with pytest.raises(ScenarioError, match=r"2026-12-21 the sun is never above 10 degrees.*latitude 78"):
+        days(winter)
+
+
+def test_clear_sky_beam():
+    # Edwards (3.8), his table of clear-sky beams
+    got = beam_w_per_m2(np.deg2rad([90.0, 60.0, 30.0, 10.0, 5.0, -1.0]))
+    np.testing.assert_allclose(got, [1039.1, 1019.3, 931.3, 695.9, 492.0, 0.0], atol=0.06)
+
+
+# ---- hidden mounts ------------------------------------------------------------------------------------------------
+
+
+def radio_model(scenario, normal):
+    return RadioModel(scenario, scenario.pivot_enu_m, usual_normal_enu=normal)
+
+
+def field_of(scenario, count=None, seed=1):
+    return draw_field(scenario, count=count, seed=seed, sun_enu=days(scenario)[0].sun_enu[::60])
+
+
+def test_hidden_mounts_scatter_as_told():
+    scenario = changed(mount_errors={"tilt_sigma_mrad": 1.5, "fixed": {"axis_2_zero_rad": 4e-3}})
+    field = field_of(scenario, 4000)
+    index = {name: i for i, name in enumerate(PARAMETERS)}
+    off = field.true - field.nominal
+    # the scatter of a standard deviation from 4000 draws is 1.1 %
+    assert off[:, index["pedestal_tilt_north_rad"]].std() == pytest.approx(1.5e-3, rel=0.05)
+    assert off[:, index["location_up_m"]].std() == pytest.approx(0.010, rel=0.05)
+    assert np.all(off[:, index["axis_2_zero_rad"]] == 4e-3)
+    month = field.at(30.4375)[:, :2] - field.at(0.0)[:, :2]
+    assert month.std() == pytest.approx(0.05e-3, rel=0.05)
+
+
+def test_nominal_mounts_reach_their_aim_all_day():
+    scenario = load_scenario(DATA)
+    field = field_of(scenario)
+    day = days(scenario)[0]
+    sun = day.sun_enu[::1800]
+    aim = np.array(scenario.site.aim_enu_m)
+    for i in range(len(field)):
+        mount = Mount(pivot_enu_m=field.pivot_enu_m[i], parameters=dict(zip(PARAMETERS, field.nominal[i], strict=True)))
+        got = command(mount, sun_enu=sun, target_enu_m=np.broadcast_to(aim, sun.shape))
+        assert np.all(got.status == 0)
+
+
+def test_mirrors_to_track():
+    scenario = load_scenario(DATA)
+    assert field_positions(scenario, None)[0] == scenario.heliostat_ids
+    assert field_positions(scenario, 3)[0] == scenario.heliostat_ids[:3]
+    ids, pivot = field_positions(scenario, 5000)
+    radius = np.hypot(pivot[:, 0], pivot[:, 1])
+    assert len(set(ids)) == 5000
+    assert 10.0 < radius.min() < 11.0
+    assert 99.0 < radius.max() <= 100.0
+    # even: half of the mirrors on half of the ring's area
+    assert np.mean(radius**2 < 0.5 * (100.0**2 + 10.0**2)) == pytest.approx(0.5, abs=0.01)
+    with pytest.raises(ScenarioError, match="one heliostat or more, got 0"):
+        field_positions(scenario, 0)
+    with pytest.raises(ScenarioError, match="no heliostats"):
+        field_positions(scenario.model_copy(update={"heliostat": ()}), None)
+
+
+# ---- wind ---------------------------------------------------------------------------------------------------------
+
+
+def test_gusts_have_edwards_spectrum():
+    scenario = load_scenario(DATA)
+    gusts = Gusts(scenario)
+    speed, area = scenario.tracking.wind.mean_speed_mps, scenario.tracking.mirror_area_m2
+    series = gusts.run(gusts.begin(generator(3, 0), 400), generator(3, 1), 4096).astype(np.float64)
+    assert series.std() == pytest.approx(gusts.sigma_mps, rel=0.03)
+    power = np.mean(np.abs(np.fft.rfft(series, axis=1)) ** 2, axis=0) * 2.0 / 4096
+    f = np.fft.rfftfreq(4096)
+    b = 1200.0 * f / speed
+    chi = (1.0 + (2.0 * f * np.sqrt(area) / speed) ** (4.0 / 3.0)) ** -2.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        want = 0.04 * speed**2 * 4.0 * b**2 / (1.0 + b**2) ** (4.0 / 3.0) * chi / f
+    for low, high in ((1e-3, 5e-3), (5e-3, 0.02), (0.02, 0.1)):
+        band = (f >= low) & (f < high)
+        assert power[band].sum() / want[band].sum() == pytest.approx(1.0, abs=0.15)
+
+
+def test_deflection_grows_with_the_square_of_the_wind():
+    slow, fast = (Gusts(changed(wind={"mean_speed_mps": v})) for v in (3.0, 6.0))
+    np.testing.assert_allclose(fast.bend_rad(np.zeros(1)), 4.0 * slow.bend_rad(np.zeros(1)))
+
+
+# ---- radio --------------------------------------------------------------------------------------------------------
+
+
+def test_radio_errors_are_the_estimators_bound():
+    # the same numbers by another path: the layout study's map of the shared-clock, carrier, pivot estimator
+    scenario = changed(radio={"ground": "none"})
+    sun = geometry.enu_from_azimuth_elevation(0.3, 0.8)
+    mirrors = mirrors_facing(
+        scenario.pivot_enu_m, np.array(scenario.heliostat[0].receiver_mirror_m),
+        aim_enu_m=scenario.site.aim_enu_m, sun_enu=sun, arm_m=scenario.heliostat[0].arm_m,
+    )  # fmt: skip
+    errors = radio_model(scenario, mirrors.normal_enu).errors(mirrors.normal_enu, np.random.default_rng(0))
+    as_used = Estimator(name="as used", clock_sigma_m=0.0, carrier=True, pivot_sigma_m=5e-3)
+    bound = normal_map(scenario.transmitter_enu_m, mirrors, noise_of(scenario), as_used)
+    np.testing.assert_allclose(errors.sigma_rad, bound, rtol=1e-3)
+    assert errors.solved.all()
+    tones = radio_model(changed(radio={"ground": "none", "tone_snr_db": 0.0}), mirrors.normal_enu)
+    worse = tones.errors(mirrors.normal_enu, np.random.default_rng(0)).sigma_rad
+    assert np.all(worse > 100.0 * errors.sigma_rad)
+    assert "shared-clock" in ESTIMATORS
+
+
+def test_hidden_transmitters_cost_accuracy_and_at_last_the_pose():
+    scenario = changed(radio={"ground": "none", "hidden_transmitters": 0.4})
+    normal = geometry.unit(np.array([0.0, 0.0, 50.0]) - scenario.pivot_enu_m + [0.0, 40.0, 60.0])
+    model = radio_model(scenario, normal)
+    clear = radio_model(changed(radio={"ground": "none"}), normal).errors(normal, np.random.default_rng(0))
+    some = model.errors(normal, np.random.default_rng(0))
+    assert np.all(some.sigma_rad[some.solved] >= clear.sigma_rad[some.solved] * (1.0 - 1e-9))
+    assert np.any(some.sigma_rad > 1.05 * clear.sigma_rad)
+    dark = radio_model(changed(radio={"ground": "none", "hidden_transmitters": 1.0}), normal)
+    assert not dark.errors(normal, np.random.default_rng(0)).solved.any()
+
+
+def test_a_reflection_that_is_ignored_turns_normals():
+    scenario = changed(radio={"ground": "ignored"})
+    normal = geometry.unit(np.array([0.0, 0.0, 50.0]) - scenario.pivot_enu_m + [0.0, 40.0, 60.0])
+    ignored = radio_model(scenario, normal).errors(normal, np.random.default_rng(0))
+    estimated = radio_model(load_scenario(DATA), normal).errors(normal, np.random.default_rng(0))
+    assert np.sqrt(np.mean(ignored.bias_rad**2)) > 1e-3
+    assert not estimated.bias_rad.any()
+    assert np.all(estimated.sigma_rad < 3.0 * ignored.sigma_rad)
+
+
+# ---- methods, scores ----------------------------------------------------------------------------------------------
+
+
+def test_methods_are_chosen_by_name():
+    assert [m.name for m in choose((), collector="heliostat")] == [n for n in METHODS if n != "sun-sensor"]
+    assert "sun-sensor" in [m.name for m in choose((), collector="dish")]
+    with pytest.raises(InvalidInputError, match="'sonar'; known are open-loop"):
+        choose(("sonar",), collector="heliostat")
+    with pytest.raises(InvalidInputError, match="cannot steer a heliostat"):
+        choose(("sun-sensor",), collector="heliostat")
+    with pytest.raises(InvalidInputError, match="each method once"):
+        choose(("radio", "radio"), collector="heliostat")
+
+
+def test_quantiles_from_the_histogram():
+    rng = np.random.default_rng(1)
+    angles = np.abs(rng.normal(0.0, 3e-4, 100_000))
+    slot = (_kernels.BINS_PER_DECADE * np.log10(np.maximum(angles, 1e-6) / _kernels.LOWEST_RAD)).astype(int)
+    histogram = np.bincount(slot, minlength=_kernels.N_BIN)[None]
+    assert quantile(histogram, 0.95)[0] == pytest.approx(np.quantile(angles, 0.95), rel=0.01)
+    assert np.isnan(quantile(np.zeros((1, _kernels.N_BIN), int), 0.95)[0])
+
+
+@pytest.mark.parametrize(
+    ("table", "complaint"),
+    [
+        ("control_interval_s = 2.5", "multiple of `servo_interval_s`"),
+        ("first_hour = 14.0\nlast_hour = 9.0", "must be before `last_hour`"),
+        ("inner_radius_m = 200.0", "`inner_radius_m` must be less"),
+        ("[tracking.radio]\noutages = [{first_hour = 12.0, last_hour = 11.0}]", "must be before `last_hour`"),
+        ("[tracking.wind]\nspeed = 3.0", "unknown key"),
+    ],
+)
+def test_contradictory_tracking_tables_are_refused(table, complaint):
+    plain = load_scenario(ROOT / "data" / "table2_100m.toml").to_toml()
+    with pytest.raises(ScenarioError, match=complaint):
+        parse_scenario(f"{plain}\n[tracking]\n{table}\n")
