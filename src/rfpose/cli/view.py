@@ -10,7 +10,7 @@ from rfpose.cli._support import common_options, emit_json, examples, force_optio
 
 __all__ = ["command"]
 
-VIEW_NAMES = ("recording", "field", "layout")
+VIEW_NAMES = ("recording", "field", "layout", "tracking")
 THEMES = ("light", "dark")
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "VIEW_NAMES", "export", "open_window", "save_widget", "settle"]
 
 FORMATS = (".png", ".svg", ".html")
-VIEW_NAMES = ("recording", "field", "layout")
+VIEW_NAMES = ("recording", "field", "layout", "tracking")
 _TIMEOUT_S = 300.0
 _QUIET_S = 0.35
 """Longer than any timer that views start work by."""
@@ -201,6 +201,7 @@ def _select(window: MainWindow, *, heliostat: str | None, transmitter: str | Non
             raise InvalidInputError(f"there is no {key} `{name}`; choose one of {listed or 'none: no scenario'}")
         chosen[key] = names.index(name)
     window.session.select(**chosen)
+    window.session.playback.scrub(frame)
 
 
 def picture_tag(app: QApplication, window: MainWindow, widget: QWidget, prepare: Callable[[], None]) -> str:

@@ -35,13 +35,14 @@ from rfpose.viewer.views.field import FieldView
 from rfpose.viewer.views.layout import LayoutView
 from rfpose.viewer.views.parts import View
 from rfpose.viewer.views.recording import RecordingView
+from rfpose.viewer.views.tracking import TrackingView
 from rfpose.viewer.views.welcome import Welcome
 from rfpose.viewer.workers import Workers
 
 __all__ = ["VIEWS", "MainWindow"]
 
-VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView)
-_FIRST_VIEW = {"recording": "recording", "result": "field", "scenario": "layout"}
+VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView, TrackingView)
+_FIRST_VIEW = {"recording": "recording", "result": "field", "scenario": "layout", "track": "tracking"}
 _FILES = "All of ours (*.h5 *.hdf5 *.toml *.sigmf-meta *.sigmf-data);;All files (*)"
 _BUSY_AFTER_MS = 250
 _KEYS = (
@@ -49,6 +50,7 @@ _KEYS = (
     ("F5", "read the open file again"),
     ("Ctrl+1 … Ctrl+4", "go to a view"),
     ("Page Up, Page Down", "frame before, frame after"),
+    ("Space", "play, pause (tracking)"),
     ("[ and ]", "transmitter before, transmitter after"),
     ("Ctrl+Z, Ctrl+Shift+Z", "undo, redo (layout)"),
     ("A, Delete", "add, remove a transmitter (layout)"),
@@ -190,6 +192,7 @@ class MainWindow(QMainWindow):
         action("View", "Frame after", "PgDown", lambda: self._step(1))
         action("View", "Transmitter before", "[", lambda: self._next_transmitter(-1))
         action("View", "Transmitter after", "]", lambda: self._next_transmitter(1))
+        action("View", "Play or pause", "Space", lambda: self.session.playback.toggle())
         action("View", "Dark or light", "Ctrl+T", self.switch_theme)
         action("View", "Dismiss, cancel", "Escape", self._escape)
         action("Help", "Keys", "F1", self.show_keys)
@@ -384,6 +387,9 @@ class MainWindow(QMainWindow):
             self.session.dismiss()
 
     def _step(self, by: int) -> None:
+        if self.current() == "tracking":
+            self.session.playback.step(by)
+            return
         self.session.select(frame=self.session.selection.frame + by)
 
     def _next_transmitter(self, by: int) -> None:

@@ -13,12 +13,14 @@ from rfpose.errors import RfposeError
 from rfpose.pipeline.field_view import FieldPicture, field_of_result, field_of_scenario
 from rfpose.pipeline.result_file import Result, is_result, read_result
 from rfpose.pipeline.spectra import SharedRecording, viewing_frames
+from rfpose.pipeline.track_file import is_track, read_track
+from rfpose.pipeline.track_view import TrackPicture, picture_of_track
 from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["Document", "Kind", "open_document"]
 
-Kind = Literal["recording", "result", "scenario"]
+Kind = Literal["recording", "result", "scenario", "track"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,6 +37,8 @@ class Document:
         Open recording with its frames; None and empty where there is none.
     result
         For a result.
+    track
+        For a tracking run.
     notes
         What the user should know, one line each.
     """
@@ -47,6 +51,7 @@ class Document:
     frame_start_index: npt.NDArray[np.int64]
     frame_samples: int = 0
     result: Result | None = None
+    track: TrackPicture | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -73,7 +78,7 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None) 
     Parameters
     ----------
     path
-        A scenario (.toml), a result, or a recording in any format.
+        A scenario (.toml), a result, a tracking run, or a recording in any format.
     scenario_path
         Site of a recording that brings none; wins over its own.
 
@@ -90,6 +95,16 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None) 
         )
     if path.is_file() and is_result(path):
         return _result(path)
+    if path.is_file() and is_track(path):
+        track = read_track(path)
+        return Document(
+            path=path,
+            kind="track",
+            scenario=track.scenario,
+            field=field_of_scenario(track.scenario),
+            track=picture_of_track(track),
+            frame_start_index=_none(),
+        )
     given = None if scenario_path is None else load_scenario(scenario_path)
     return _recording(SharedRecording(open_recording(path, scenario=given)))
 

@@ -71,7 +71,7 @@ class Session:
                 self.layout = LayoutEdit(document.scenario)
             receivers = document.receiver_ids
             self.selection = Selection(receiver=receivers[0] if receivers else None)
-        self.playback.load(0 if document is None or document.field is None else document.field.n_frame)
+        self.playback.load(0 if document is None or document.track is None else document.track.n_instant)
         self.message = None
         if document is not None and document.notes:
             self.message = Message(text="; ".join(document.notes))

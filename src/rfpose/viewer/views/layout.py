@@ -100,7 +100,7 @@ class LayoutView(View):
         self.graphs = pg.GraphicsLayoutWidget()
         self.plot = plot_in(self.graphs, theme, x="east [m]", y="north [m]")
         self.plot.setAspectLocked(True)
-        self.dots = Dots()
+        self.dots = Dots(rim=theme.muted)
         self.plot.addItem(self.dots)
         self.worst = pg.ScatterPlotItem(size=20, pen=pg.mkPen("#D55E00", width=2.5), brush=None)
         self.plot.addItem(self.worst)

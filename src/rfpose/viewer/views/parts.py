@@ -30,6 +30,7 @@ __all__ = ["Dots", "Plan", "Scale", "Table", "View", "plot_in", "segments"]
 
 _PICK_PX = 14.0
 _LEVELS = 64
+_NUMERIC = "0123456789-−+.–n"
 _MANY = 5000
 """Dots above this number are drawn without smoothed edges."""
 
@@ -86,9 +87,11 @@ def segments(start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray
 class Dots(pg.GraphicsObject):  # type: ignore[misc]
     """Many dots, each in one of a few dozen colours; drawn a colour at a time, so that thousands are quick."""
 
-    def __init__(self, size_px: float = 8.0) -> None:
+    def __init__(self, size_px: float = 8.0, *, rim: str | None = None) -> None:
         super().__init__()
         self._size = size_px
+        self._rim = None if rim is None else QColor(rim)
+        self._all: Any = None
         self._x = self._y = np.empty(0)
         self._groups: list[tuple[QColor, Any]] = []
         self._bounds = QRectF()
@@ -101,6 +104,7 @@ class Dots(pg.GraphicsObject):  # type: ignore[misc]
         seen = np.isfinite(x) & np.isfinite(y)
         self._x, self._y, self._size = np.asarray(x), np.asarray(y), size_px
         self._groups = []
+        self._all = pg.functions.arrayToQPolygonF(self._x[seen], self._y[seen]) if self._rim is not None else None
         for k in np.unique(colour[seen]) if seen.any() else ():
             mine = seen & (colour == k)
             self._groups.append((table[int(k)], pg.functions.arrayToQPolygonF(self._x[mine], self._y[mine])))
@@ -114,8 +118,11 @@ class Dots(pg.GraphicsObject):  # type: ignore[misc]
     def paint(self, painter: QPainter, *_: Any) -> None:
         """Draw, a colour at a time."""
         painter.setRenderHint(QPainter.RenderHint.Antialiasing, len(self._x) < _MANY)
-        for colour, polygon in self._groups:
-            pen = QPen(colour, self._size)
+        groups = self._groups
+        if self._all is not None and self._rim is not None and len(self._x) < _MANY:
+            groups = [(self._rim, self._all), *groups]
+        for colour, polygon in groups:
+            pen = QPen(colour, self._size + (2.0 if colour is self._rim else 0.0))
             pen.setCosmetic(True)
             pen.setCapStyle(Qt.PenCapStyle.RoundCap if len(self._x) < _MANY else Qt.PenCapStyle.SquareCap)
             painter.setPen(pen)
@@ -194,7 +201,7 @@ class Plan:
         self.plot, self.theme, self._names = plot, theme, names
         plot.setAspectLocked(True)
         self.lines = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1.5), connect="pairs")
-        self.dots = Dots()
+        self.dots = Dots(rim=theme.muted)
         self.picked = pg.ScatterPlotItem(size=20, pen=pg.mkPen(theme.accent, width=2.5), brush=None, pxMode=True)
         self.transmitters = pg.ScatterPlotItem(symbol="t1", size=14, pxMode=True)
         self.calibration = pg.ScatterPlotItem(symbol="s", size=9, pen=None, brush="#CC79A7", pxMode=True)
@@ -282,7 +289,7 @@ class Table(QTableWidget):
         for i, row in enumerate(rows):
             for j, text in enumerate(row):
                 item = QTableWidgetItem(text)
-                if j:
+                if j and (not text or text[0] in _NUMERIC):
                     item.setTextAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
                 self.setItem(i, j, item)
         if 0 <= chosen < len(rows):

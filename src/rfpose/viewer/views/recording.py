@@ -158,7 +158,7 @@ class RecordingView(View):
         self.frame_line = pg.InfiniteLine(angle=0, pen=pg.mkPen("#E69F00", width=1.5))
         self.waterfall_plot.addItem(self.frame_line, ignoreBounds=True)
         self.phase_plot = plot_in(self.graphs, theme, x="time from the first sample [s]", y=None, row=2)
-        self.phase_plot.setLabel("left", "phase difference from its mean", units="rad")
+        self.phase_plot.setLabel("left", "phase − mean", units="rad")
         self.phase_plot.getAxis("left").enableAutoSIPrefix(True)
         self.phase_bars = pg.ErrorBarItem(x=np.empty(0), y=np.empty(0), height=np.empty(0), beam=0.0)
         self.phase_curve = pg.PlotDataItem(pen=pg.mkPen(SERIES[0], width=1.5), symbol="o", symbolSize=6, symbolPen=None)

@@ -54,7 +54,7 @@ class Space:
         self._ground = pg.PlotCurveItem(pen=pg.mkPen(theme.grid, width=1), connect="finite")
         self._masts = pg.PlotCurveItem(pen=muted, connect="pairs")
         self._normals = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1.2), connect="pairs")
-        self.dots = Dots()
+        self.dots = Dots(rim=theme.muted)
         self._tips = pg.ScatterPlotItem(symbol="t1", size=12, pen=None, brush="#D55E00")
         self._picked = pg.ScatterPlotItem(size=16, pen=pg.mkPen(theme.accent, width=2), brush=None)
         for item in (self._ground, self._masts, self._normals, self.dots, self._tips, self._picked):

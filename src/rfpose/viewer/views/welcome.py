@@ -16,6 +16,7 @@ __all__ = ["Welcome"]
 _KINDS = (
     ("A recording", "rfpose-iq (.h5), a Digital RF directory, SigMF: spectrum, waterfall, phases"),
     ("A result", "what rfpose process writes: every mirror's pose, error, covariance, exclusions"),
+    ("A tracking run", "what rfpose track writes: mirrors, beams and the methods' errors, played over the day"),
     ("A scenario", "a site in TOML: drag its transmitters and see what the mirrors can be known to"),
 )
 
