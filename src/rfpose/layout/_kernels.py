@@ -7,9 +7,11 @@ receiver, transmitter), or has no rows when everything is seen. A mirror whose p
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.jit import kernel, kernel_parallel
 
@@ -19,6 +21,55 @@ FLOOR = 1e-13
 SINGULAR_DET = 1e-12
 
 DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
+
+Array = npt.NDArray[np.float64]
+
+
+class Field(NamedTuple):
+    """Transmitters and mirrors, as the kernels take them.
+
+    ``transmitter`` (xyz, transmitter), ``place`` (1 or mirror, receiver, xyz) in the mirror frame, ``pivot`` (mirror,
+    xyz), ``rot`` (mirror, 3, 3), ``range2`` the square of the reference range of free-space noise or zero, ``visible``.
+    """
+
+    transmitter: Array
+    place: Array
+    pivot: Array
+    rot: Array
+    range2: float
+    visible: npt.NDArray[np.uint8]
+
+
+@kernel
+def span(chunk, n_chunk, n):
+    """First and past-the-last row of a piece of the work."""
+    return n * chunk // n_chunk, n * (chunk + 1) // n_chunk
+
+
+@kernel
+def look(field, i, r, arm, u, inverse):
+    """Set arm, unit vectors from the transmitters and inverse distances of receiver r of mirror i."""
+    arm_of(field.rot[i], field.place[i % field.place.shape[0], r], arm)
+    directions(
+        field.transmitter, field.pivot[i, 0] + arm[0], field.pivot[i, 1] + arm[1], field.pivot[i, 2] + arm[2], u,
+        inverse,
+    )  # fmt: skip
+
+
+@kernel
+def normal_variance(cov, rot):
+    """Variance of the normal: the rotation's less that about the normal."""
+    total = cov[0, 0] + cov[1, 1] + cov[2, 2]
+    for a in range(3):
+        for b in range(3):
+            total -= rot[a, 2] * cov[a, b] * rot[b, 2]
+    return total
+
+
+@kernel
+def torque(arm, x, y, z):
+    """Return arm × (x, y, z)."""
+    return arm[1] * z - arm[2] * y, arm[2] * x - arm[0] * z, arm[0] * y - arm[1] * x
 
 
 @kernel
@@ -156,18 +207,17 @@ def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
 @kernel_parallel
 def dop_rows(transmitter, weight, visible, point, n_chunk, out):
     """Variances east, north, up of each point per unit of one transmitter's range variance; (point, xyz)."""
-    n = point.shape[0]
     for chunk in numba.prange(n_chunk):
-        dop_rows_part(n * chunk // n_chunk, n * (chunk + 1) // n_chunk, transmitter, weight, visible, point, out)
+        begin, end = span(chunk, n_chunk, point.shape[0])
+        dop_rows_part(begin, end, transmitter, weight, visible, point, out)
 
 
 @kernel
-def tilt_independent_part(
-    begin, end, transmitter, place, plane_slope, pivot, rot, own, common, range2, visible, n_min, out
-):
+def tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, out):
     """Do rows ``begin`` to ``end`` of `tilt_independent`."""
     n_group, n_transmitter = own.shape
-    n_receiver = place.shape[1]
+    n_receiver = field.place.shape[1]
+    range2, visible = field.range2, field.visible
     seen_all = visible.shape[0] == 0
     calibrated = np.any(common > 0.0)
     arm = np.empty(3)
@@ -184,13 +234,11 @@ def tilt_independent_part(
     q = np.empty((3, 3))
     gain = np.empty((n_receiver, 3, 3))
     for i in range(begin, end):
-        here = place[i % place.shape[0]]
-        turn_slopes(rot[i], plane_slope[i % place.shape[0]], jac)
+        turn_slopes(field.rot[i], plane_slope[i % plane_slope.shape[0]], jac)
         total = 0.0
         good = True
         for r in range(n_receiver):
-            arm_of(rot[i], here[r], arm)
-            directions(transmitter, pivot[i, 0] + arm[0], pivot[i, 1] + arm[1], pivot[i, 2] + arm[2], u[r], inverse)
+            look(field, i, r, arm, u[r], inverse)
             mask = none if seen_all else visible[i, r]
             m[:] = 0.0
             seen = 0
@@ -247,28 +295,14 @@ def tilt_independent_part(
 
 
 @kernel_parallel
-def tilt_independent(transmitter, place, plane_slope, pivot, rot, own, common, range2, visible, n_min, n_chunk, out):
+def tilt_independent(field, plane_slope, own, common, n_min, n_chunk, out):
     """Variance of the normal [rad²] from fits of each receiver by itself; (mirror,).
 
     ``own``, ``common`` (group, transmitter): variances of a receiver's own noise and of the calibration's.
     """
-    n = pivot.shape[0]
     for chunk in numba.prange(n_chunk):
-        tilt_independent_part(
-            n * chunk // n_chunk,
-            n * (chunk + 1) // n_chunk,
-            transmitter,
-            place,
-            plane_slope,
-            pivot,
-            rot,
-            own,
-            common,
-            range2,
-            visible,
-            n_min,
-            out,
-        )
+        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
+        tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, out)
 
 
 @kernel
@@ -297,9 +331,10 @@ def add_receiver(info, arm, s, m, clock, first):
     for b in range(3):
         # column b of M; (arm × column) is what the rotation sees
         cx, cy, cz = m[0, b], m[1, b], m[2, b]
-        info[first + 3, first + b] += ay * cz - az * cy
-        info[first + 4, first + b] += az * cx - ax * cz
-        info[first + 5, first + b] += ax * cy - ay * cx
+        tx, ty, tz = torque(arm, cx, cy, cz)
+        info[first + 3, first + b] += tx
+        info[first + 4, first + b] += ty
+        info[first + 5, first + b] += tz
     for a in range(3):
         if a == 0:
             k0, k1, k2 = 0.0, -az, ay
@@ -317,9 +352,10 @@ def add_receiver(info, arm, s, m, clock, first):
         if a == 2:
             info[first + 5, first + 5] += ax * y - ay * x
         info[first + a, clock] += s[a]
-    info[first + 3, clock] += ay * s[2] - az * s[1]
-    info[first + 4, clock] += az * s[0] - ax * s[2]
-    info[first + 5, clock] += ax * s[1] - ay * s[0]
+    tx, ty, tz = torque(arm, s[0], s[1], s[2])
+    info[first + 3, clock] += tx
+    info[first + 4, clock] += ty
+    info[first + 5, clock] += tz
 
 
 @kernel
@@ -352,12 +388,11 @@ def add_arm(ax, ay, az, m, pp, tp, tt):
 
 
 @kernel
-def tilt_calibrated_part(
-    begin, end, transmitter, place, pivot, rot, weight, shared, pivot_info, roll_info, range2, visible, out
-):
+def tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_info, out):
     """Do rows ``begin`` to ``end`` of `tilt_calibrated`."""
-    n_transmitter = transmitter.shape[1]
-    n_receiver = place.shape[1]
+    n_transmitter = field.transmitter.shape[1]
+    n_receiver = field.place.shape[1]
+    range2, visible, rot = field.range2, field.visible, field.rot
     seen_all = visible.shape[0] == 0
     arm = np.empty(3)
     u = np.empty((3, n_transmitter))
@@ -372,14 +407,12 @@ def tilt_calibrated_part(
     tt = np.empty((3, 3))
     mean = np.empty(7)
     for i in range(begin, end):
-        here = place[i % place.shape[0]]
         pp[:] = 0.0
         tp[:] = 0.0
         tt[:] = 0.0
         mean[:] = 0.0
         for r in range(n_receiver):
-            arm_of(rot[i], here[r], arm)
-            directions(transmitter, pivot[i, 0] + arm[0], pivot[i, 1] + arm[1], pivot[i, 2] + arm[2], u, inverse)
+            look(field, i, r, arm, u, inverse)
             if not seen_all or range2 > 0.0:
                 row_weights(weight, inverse, range2, none if seen_all else visible[i, r], seen_all, w)
             moments(u, w, s, m)
@@ -387,9 +420,10 @@ def tilt_calibrated_part(
                 mean[0] += s[0]
                 mean[1] += s[1]
                 mean[2] += s[2]
-                mean[3] += arm[1] * s[2] - arm[2] * s[1]
-                mean[4] += arm[2] * s[0] - arm[0] * s[2]
-                mean[5] += arm[0] * s[1] - arm[1] * s[0]
+                x, y, z = torque(arm, s[0], s[1], s[2])
+                mean[3] += x
+                mean[4] += y
+                mean[5] += z
                 mean[6] += s[3]
             elif s[3] > 0.0:
                 centre(s, m)
@@ -425,64 +459,29 @@ def tilt_calibrated_part(
                 m[b, a] = m[a, b]
         # what is left of the rotation must stand out of the rounding of what came off
         if m[0, 0] + m[1, 1] + m[2, 2] > FLOOR * turn and invert(m, q):
-            total = q[0, 0] + q[1, 1] + q[2, 2]
-            for a in range(3):
-                for b in range(3):
-                    total -= rot[i, a, 2] * q[a, b] * rot[i, b, 2]
-            out[i] = total
+            out[i] = normal_variance(q, rot[i])
 
 
 @kernel_parallel
-def tilt_calibrated(
-    transmitter, place, pivot, rot, weight, shared, pivot_info, roll_info, range2, visible, n_chunk, out
-):
+def tilt_calibrated(field, weight, shared, pivot_info, roll_info, n_chunk, out):
     """Variance of the normal [rad²] of rigid mirrors with perfectly calibrated transmitters; (mirror,).
 
     ``weight`` (transmitter,) is the sum over tones. Clocks, one a receiver or one a mirror (``shared``), come off as
     means, the pivot as a block: far less arithmetic than `tilt_rigid`, and the same result.
     """
-    n = pivot.shape[0]
     for chunk in numba.prange(n_chunk):
-        tilt_calibrated_part(
-            n * chunk // n_chunk,
-            n * (chunk + 1) // n_chunk,
-            transmitter,
-            place,
-            pivot,
-            rot,
-            weight,
-            shared,
-            pivot_info,
-            roll_info,
-            range2,
-            visible,
-            out,
-        )
+        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
+        tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_info, out)
 
 
 @kernel
 def tilt_rigid_part(
-    begin,
-    end,
-    transmitter,
-    place,
-    pivot,
-    rot,
-    weight,
-    bias_info,
-    group_class,
-    n_class,
-    shared,
-    tie,
-    pivot_info,
-    roll_info,
-    range2,
-    visible,
-    out,
+    begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out
 ):
     """Do rows ``begin`` to ``end`` of `tilt_rigid`."""
     n_group, n_transmitter = weight.shape
-    n_receiver = place.shape[1]
+    n_receiver = field.place.shape[1]
+    range2, visible, rot = field.range2, field.visible, field.rot
     n_clock = 1 if shared else n_receiver
     first = n_class * n_clock
     size = first + 6
@@ -507,14 +506,9 @@ def tilt_rigid_part(
     row = np.empty(size)
     before = np.empty(size)
     for i in range(begin, end):
-        here = place[i % place.shape[0]]
         info[:] = 0.0
         for r in range(n_receiver):
-            arm_of(rot[i], here[r], arm[r])
-            directions(
-                transmitter, pivot[i, 0] + arm[r, 0], pivot[i, 1] + arm[r, 1], pivot[i, 2] + arm[r, 2], u[r],
-                inverse[r],
-            )  # fmt: skip
+            look(field, i, r, arm[r], u[r], inverse[r])
         for g in range(n_group):
             for r in range(n_receiver):
                 mask = none if seen_all else visible[i, r]
@@ -534,9 +528,10 @@ def tilt_rigid_part(
                         row[first] += x
                         row[first + 1] += y
                         row[first + 2] += z
-                        row[first + 3] += arm[r, 1] * z - arm[r, 2] * y
-                        row[first + 4] += arm[r, 2] * x - arm[r, 0] * z
-                        row[first + 5] += arm[r, 0] * y - arm[r, 1] * x
+                        x, y, z = torque(arm[r], x, y, z)
+                        row[first + 3] += x
+                        row[first + 4] += y
+                        row[first + 5] += z
                     if total > 0.0:
                         scale = 1.0 / (total + bias_info[g, t])
                         for a in range(size):
@@ -576,67 +571,30 @@ def tilt_rigid_part(
                 m[a, b] = m[b, a] = info[first + 3 + a, first + 3 + b]
         if not invert(m, q):
             continue
-        total = 0.0
-        for a in range(3):
-            total += q[a, a]
-            for b in range(3):
-                total -= rot[i, a, 2] * q[a, b] * rot[i, b, 2]
-        out[i] = total
+        out[i] = normal_variance(q, rot[i])
 
 
 @kernel_parallel
-def tilt_rigid(
-    transmitter,
-    place,
-    pivot,
-    rot,
-    weight,
-    bias_info,
-    group_class,
-    n_class,
-    shared,
-    tie,
-    pivot_info,
-    roll_info,
-    range2,
-    visible,
-    n_chunk,
-    out,
-):
+def tilt_rigid(field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, n_chunk, out):
     """Variance of the normal [rad²] of rigid mirrors; (mirror,).
 
     ``weight``, ``bias_info`` (group, transmitter): 1/variance of own noise and of the transmitter's own error
     (infinite = perfectly calibrated, 0 = not at all). ``shared``: one clock a mirror and class; else one a receiver,
     whose differences have information ``tie`` a pair.
     """
-    n = pivot.shape[0]
     for chunk in numba.prange(n_chunk):
+        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
         tilt_rigid_part(
-            n * chunk // n_chunk,
-            n * (chunk + 1) // n_chunk,
-            transmitter,
-            place,
-            pivot,
-            rot,
-            weight,
-            bias_info,
-            group_class,
-            n_class,
-            shared,
-            tie,
-            pivot_info,
-            roll_info,
-            range2,
-            visible,
-            out,
+            begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out
         )
 
 
 @kernel
-def objective_rows_part(begin, end, method, transmitter, weight, place, plane_slope, pivot, rot, value, gradient):
+def objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient):
     """Do rows ``begin`` to ``end`` of `objective_rows`."""
-    n_transmitter = transmitter.shape[1]
-    n_receiver = 1 if method == DOP else place.shape[1]
+    n_transmitter = field.transmitter.shape[1]
+    n_receiver = 1 if method == DOP else field.place.shape[1]
+    pivot, rot = field.pivot, field.rot
     size = 3 if method <= INDEPENDENT else 6
     u = np.empty((n_receiver, 3, n_transmitter))
     inverse = np.empty((n_receiver, n_transmitter))
@@ -650,14 +608,12 @@ def objective_rows_part(begin, end, method, transmitter, weight, place, plane_sl
     q3 = np.empty((3, 3))
     for i in range(begin, end):
         if method == INDEPENDENT:
-            turn_slopes(rot[i], plane_slope[i % place.shape[0]], jac)
+            turn_slopes(rot[i], plane_slope[i % plane_slope.shape[0]], jac)
         for r in range(n_receiver):
-            if method != DOP:
-                arm_of(rot[i], place[i % place.shape[0], r], arm[r])
-            directions(
-                transmitter, pivot[i, 0] + arm[r, 0], pivot[i, 1] + arm[r, 1], pivot[i, 2] + arm[r, 2], u[r],
-                inverse[r],
-            )  # fmt: skip
+            if method == DOP:
+                directions(field.transmitter, pivot[i, 0], pivot[i, 1], pivot[i, 2], u[r], inverse[r])
+            else:
+                look(field, i, r, arm[r], u[r], inverse[r])
         fill_rows(u, arm, weight, size, method == SHARED, row, mean)
         value[i] = 0.0
         info[:] = 0.0
@@ -687,27 +643,15 @@ def objective_rows_part(begin, end, method, transmitter, weight, place, plane_sl
 
 
 @kernel_parallel
-def objective_rows(method, transmitter, weight, place, plane_slope, pivot, rot, n_chunk, value, gradient):
+def objective_rows(method, field, weight, plane_slope, n_chunk, value, gradient):
     """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
 
     ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
     Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
     """
-    n = pivot.shape[0]
     for chunk in numba.prange(n_chunk):
-        objective_rows_part(
-            n * chunk // n_chunk,
-            n * (chunk + 1) // n_chunk,
-            method,
-            transmitter,
-            weight,
-            place,
-            plane_slope,
-            pivot,
-            rot,
-            value,
-            gradient,
-        )
+        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
+        objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient)
 
 
 @kernel
@@ -724,9 +668,7 @@ def fill_rows(u, arm, weight, size, shared, row, mean):
             row[r, t, 0] = x
             row[r, t, 1] = y
             row[r, t, 2] = z
-            row[r, t, 3] = arm[r, 1] * z - arm[r, 2] * y
-            row[r, t, 4] = arm[r, 2] * x - arm[r, 0] * z
-            row[r, t, 5] = arm[r, 0] * y - arm[r, 1] * x
+            row[r, t, 3], row[r, t, 4], row[r, t, 5] = torque(arm[r], x, y, z)
             for a in range(size):
                 mean[r, a] += weight[t] / total * row[r, t, a]
     for a in range(size):

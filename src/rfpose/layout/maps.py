@@ -302,11 +302,10 @@ def normal_map(
     seen = _mask(visible, (n_mirror, n_receiver, n_transmitter), (n_mirror, n_receiver))
     range2 = 0.0 if noise.reference_range_m is None else noise.reference_range_m**2
     out = np.full(n_mirror, np.nan)
-    by_axis = np.ascontiguousarray(transmitter.T)
+    field_seen = _field(transmitter, mirrors, range2, seen)
     if not estimator.rigid:
         _kernels.tilt_independent(
-            by_axis, mirrors.receiver_mirror_m, _plane_slope(mirrors.receiver_mirror_m), mirrors.pivot_enu_m,
-            mirrors.rot_enu_from_mirror, noise.tone_sigma_m**2, noise.calibration_sigma_m**2, range2, seen,
+            field_seen, _plane_slope(mirrors.receiver_mirror_m), noise.tone_sigma_m**2, noise.calibration_sigma_m**2,
             _MIN_TRANSMITTER[3], _chunks(n_mirror), out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
@@ -315,8 +314,7 @@ def normal_map(
     calibrated = not estimator.carrier and not np.any(noise.calibration_sigma_m > 0.0)
     if calibrated and (shared or np.isinf(estimator.clock_sigma_m)):
         _kernels.tilt_calibrated(
-            by_axis, mirrors.receiver_mirror_m, mirrors.pivot_enu_m, mirrors.rot_enu_from_mirror,
-            (noise.tone_sigma_m**-2.0).sum(axis=0), shared, estimator.pivot_sigma_m**-2, roll_info, range2, seen,
+            field_seen, (noise.tone_sigma_m**-2.0).sum(axis=0), shared, estimator.pivot_sigma_m**-2, roll_info,
             _chunks(n_mirror), out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
@@ -325,11 +323,26 @@ def normal_map(
     if not shared and np.isfinite(estimator.clock_sigma_m):
         tie = 1.0 / (n_receiver * estimator.clock_sigma_m**2)
     _kernels.tilt_rigid(
-        by_axis, mirrors.receiver_mirror_m, mirrors.pivot_enu_m, mirrors.rot_enu_from_mirror, weight, bias_info,
-        group_class, 2 if estimator.carrier else 1, shared, tie, estimator.pivot_sigma_m**-2,
-        roll_info, range2, seen, _chunks(n_mirror), out,
+        field_seen, weight, bias_info, group_class, 2 if estimator.carrier else 1, shared, tie,
+        estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
     )  # fmt: skip
     return np.asarray(np.sqrt(out))
+
+
+def _field(
+    transmitter: FloatArray, mirrors: Mirrors, range2: float = 0.0, seen: npt.NDArray[np.uint8] | None = None
+) -> _kernels.Field:
+    """Return what the kernels take; ``range2`` and ``seen`` as there."""
+    if seen is None:
+        seen = np.empty((0, mirrors.receiver_mirror_m.shape[1], len(transmitter)), np.uint8)
+    return _kernels.Field(
+        transmitter=np.ascontiguousarray(transmitter.T),
+        place=mirrors.receiver_mirror_m,
+        pivot=mirrors.pivot_enu_m,
+        rot=mirrors.rot_enu_from_mirror,
+        range2=range2,
+        visible=seen,
+    )
 
 
 def _groups(noise: Noise, estimator: Estimator) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:

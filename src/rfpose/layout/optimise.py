@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout import _kernels
-from rfpose.layout.maps import Mirrors, _chunks, _plane_slope, check_site
+from rfpose.layout.maps import Mirrors, _chunks, _field, _plane_slope, check_site
 from rfpose.scenario import Scenario, Transmitter
 
 __all__ = [
@@ -296,9 +296,8 @@ def _rows(
     value = np.empty(n)
     slope = np.zeros((n, len(transmitter), 3))
     _kernels.objective_rows(
-        CRITERIA[criterion], np.ascontiguousarray(transmitter.T), np.full(len(transmitter), sigma_m**-2.0),
-        field.receiver_mirror_m, _plane_slope(field.receiver_mirror_m), field.pivot_enu_m, field.rot_enu_from_mirror,
-        _chunks(n), value, slope,
+        CRITERIA[criterion], _field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
+        _plane_slope(field.receiver_mirror_m), _chunks(n), value, slope,
     )  # fmt: skip
     return value, slope
 
