@@ -36,6 +36,9 @@ IntArray = npt.NDArray[np.int64]
 _SAFE_ROUNDING = 1e-6
 """Where rounding errs less often than this there is nothing to search."""
 
+_DECIDING_TURN_RAD = 0.3
+"""A turn less certain than this leaves each candidate's pose several minima: residuals do not decide between them."""
+
 _UNLIKELY = 1e-6
 """Residuals rarer than this are worth another start."""
 
@@ -348,7 +351,9 @@ class _Ladder:
             risk, odds = found.wrong_risk.copy(), found.odds_against.copy()
             chosen = np.zeros(len(part), np.int64)
             method = np.full(len(part), IntegerMethod.LEAST_SQUARES, np.int64)
-            bent = (risk > self.limit) & (found.straight_risk <= self.limit)
+            # where the straight-line model makes the risk, the pose itself is asked
+            bent = (risk > min(self.limit, _SAFE_ROUNDING)) & (found.straight_risk <= np.minimum(self.limit, risk / 2))
+            bent &= np.trace(prediction.cov[part][:, 3:, 3:], axis1=1, axis2=2) < _DECIDING_TURN_RAD**2
             if bent.any():
                 chosen[bent], odds[bent], complete = self._decide(k, part[bent], found, bent, poses)
                 method[bent] = IntegerMethod.CONSTRAINED
@@ -372,13 +377,13 @@ class _Ladder:
             np.repeat(poses.pivot_enu_m[mirrors], n, axis=0),
             np.repeat(poses.rot_enu_from_mirror[mirrors], n, axis=0),
         )
-        chi2 = np.where(trial.status == RigidStatus.OK, trial.chi2, np.inf).reshape(norm.shape)
-        chi2 = np.where(np.isfinite(norm), chi2, np.inf)
+        solved = (trial.status == RigidStatus.OK).reshape(norm.shape) | ~np.isfinite(norm)
+        chi2 = np.where(np.isfinite(norm) & solved, trial.chi2.reshape(norm.shape), np.inf)
         best = np.argmin(chi2, axis=1)
         lowest = chi2.min(axis=1, keepdims=True)
         with np.errstate(invalid="ignore"):
             odds = np.nan_to_num(np.exp(-0.5 * (chi2 - lowest))).sum(axis=1) - 1.0
-            complete = np.isfinite(lowest[:, 0]) & (norm[:, -1] - norm[:, 0] > _COMPLETE)
+            complete = np.isfinite(lowest[:, 0]) & (norm[:, -1] - norm[:, 0] > _COMPLETE) & solved.all(axis=1)
         return best, odds, complete
 
 

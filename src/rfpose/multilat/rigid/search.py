@@ -86,8 +86,10 @@ def predict(transmitter_enu_m: FloatArray, receiver_mirror_m: FloatArray, poses:
     to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - transmitter_enu_m
     distance = np.linalg.norm(to_receiver, axis=-1)
     direction = to_receiver / distance[..., None]
-    # d = |p + exp(θ)a − T| to second order: ½ [(θ·a)(θ·u) − |θ|²(a·u)], at most |a| |θ|²
-    bend = np.linalg.norm(arm, axis=-1) * np.trace(poses.cov[:, 3:, 3:], axis1=1, axis2=2)[:, None]
+    # d = |p + exp(θ)a − T| to second order: ½ [(θ·a)(θ·u) − |θ|²(a·u)], at most |a| |θ|²; an arm's end moves by no
+    # more than twice its length
+    turn2 = np.minimum(np.trace(poses.cov[:, 3:, 3:], axis1=1, axis2=2), 2.0)
+    bend = np.linalg.norm(arm, axis=-1) * turn2[:, None]
     return Prediction(
         distance_m=distance,
         slope=np.concatenate([direction, np.cross(arm[:, :, None], direction)], axis=-1),
