@@ -122,6 +122,44 @@ def test_a_silent_cluster_helps_itself_after_the_watchdogs_time():
     assert rig.control.command(Event.APPROACH, mine).accepted[mine].all()
 
 
+def test_what_a_dying_controller_was_about_to_say_is_not_heard():
+    rig = Rig(n=64, mode=Mode.TRACK)
+    rig.run(6)
+    rig.control.command(Event.POINT)
+    rig.control.emergency()
+    rig.control.fail_cluster(1)
+    mine = rig.control.cluster == 1
+    rig.run(2.5)
+    assert np.all(rig.control.mode[mine] == Mode.TRACK)
+    assert np.all(rig.control.mode[~mine] == Mode.EMERGENCY)
+    again = Rig(n=64, mode=Mode.TRACK)
+    again.run(4.5)  # the round that began at 4 s is under way
+    again.control.fail_cluster(1)
+    again.run(1)
+    assert np.all(again.control.report_age_s[mine] > 3.9)
+    assert np.median(again.control.report_age_s[~mine]) < 2.0
+
+
+def test_without_the_centre_clusters_go_on_then_stow():
+    rig = Rig(mode=Mode.TRACK)
+    rig.run(5)
+    rig.control.fail_centre()
+    rig.run(29, wind_m_s=20.0)
+    assert rig.modes() == {"TRACK"}
+    assert np.all(rig.orders.sun_age_s < 5.0)
+    assert "the centre is dead since 4.5 s" in rig.control.command(Event.DEFOCUS).reasons[0]
+    with pytest.raises(InvalidInputError, match=r"the centre is dead since 4.5 s and orders nothing"):
+        rig.control.emergency()
+    rig.run(3)
+    assert rig.modes() == {"EMERGENCY"}
+    rig.run(90)
+    assert rig.modes() == {"STOW"}
+    rig.control.repair_centre()
+    assert rig.control.alarms == ()
+    rig.run(1, wind_m_s=20.0)
+    assert rig.control.alarms == ("strong wind",)
+
+
 def test_wind_of_ten_metres_a_second_stows_and_calm_releases():
     rig = Rig(mode=Mode.TRACK, settings=FieldSettings(wind_release_s=30.0))
     rig.run(5, wind_m_s=9.99)
@@ -303,6 +341,19 @@ def test_power_loss_keeps_the_counts_and_nothing_moves():
     rig.control.command(Event.STOW, off)
     rig.run(60)
     np.testing.assert_array_equal(rig.control.mode == Mode.STOW, off)
+
+
+def test_what_is_on_the_wire_is_not_heard_without_power():
+    rig = Rig(mode=Mode.TRACK)
+    rig.run(6)
+    rig.control.emergency()
+    rig.control.power_off([3])
+    rig.control.power_on([3])
+    rig.run(1.5)
+    assert rig.control.mode[3] == Mode.IDLE
+    assert np.all(np.delete(rig.control.mode, 3) == Mode.EMERGENCY)
+    rig.run(4)  # asked in the next round
+    assert rig.modes() == {"EMERGENCY"}
 
 
 def test_without_counts_a_heliostat_waits_to_be_zeroed():

@@ -22,7 +22,8 @@ __all__ = ["FieldControl", "FieldSettings", "Orders", "Reply"]
 _SAFETY = {Event.EMERGENCY: 3, Event.STOW: 2, Event.DEFOCUS: 1}
 _ALLOWED_IN_ALARM = frozenset({Event.STOW, Event.EMERGENCY, Event.ZERO_COUNTS})
 _WIND, _WIND_UNKNOWN, _NIGHT = "strong wind", "wind unknown", "sun below the horizon"
-_BY_ITSELF = frozenset({_WIND, _WIND_UNKNOWN, _NIGHT})
+_CENTRE_SILENT = "centre silent"
+_BY_ITSELF = frozenset({_WIND, _WIND_UNKNOWN, _NIGHT, _CENTRE_SILENT})
 
 
 class FieldControl:
@@ -95,6 +96,7 @@ class FieldControl:
         self._time_s = float(start_s)
         self._wind_known_s = self._time_s
         self._wind_calm_s = self._time_s
+        self._centre_lost_s: float | None = None
 
     # what the centre orders
 
@@ -140,6 +142,7 @@ class FieldControl:
 
     def emergency(self, why: str = "emergency") -> None:
         """Defocus and stow the whole field by urgent orders; keeps until `release`."""
+        self._check_centre()
         if why in _BY_ITSELF:
             raise InvalidInputError(f"`why` must not be one of {sorted(_BY_ITSELF)}, which come and go by themselves")
         self._raise_alarm(why, Event.EMERGENCY)
@@ -149,6 +152,15 @@ class FieldControl:
         self._alarms = {name: since for name, since in self._alarms.items() if name in _BY_ITSELF}
 
     # what happens to the hardware
+
+    def fail_centre(self) -> None:
+        """Let the centre die: no orders, nobody watches wind and sun; clusters go on, then help themselves."""
+        self._centre_lost_s = self._time_s if self._centre_lost_s is None else self._centre_lost_s
+
+    def repair_centre(self) -> None:
+        """Let the centre work again."""
+        self._centre_lost_s = None
+        self._alarms.pop(_CENTRE_SILENT, None)
 
     def fail_cluster(self, cluster: int) -> None:
         """Let a cluster's controller die at once; its heliostats hear nothing more."""
@@ -270,8 +282,11 @@ class FieldControl:
         seen = np.broadcast_to(np.asarray(found, np.bool_), (n,))
         self._time_s = float(time_s)
         self._heliostats.count_steps(axis)
-        self._watch_wind(wind_m_s)
-        self._watch_sun(sun)
+        if self._centre_lost_s is None:
+            self._watch_wind(wind_m_s)
+            self._watch_sun(sun)
+        elif self._time_s - self._centre_lost_s >= self.settings.centre_silence_s:
+            self._raise_alarm(_CENTRE_SILENT, Event.EMERGENCY)
         self._wire.communicate(self._time_s, sun)
         self._heliostats.watchdog(self._time_s, self._wire.watchdog_s)
         self._heliostats.notice(self._time_s, aim_axis, feedback, seen)
@@ -304,7 +319,7 @@ class FieldControl:
             {
                 "alarms": self._alarms,
                 "rng": self._wire.rng.bit_generator.state,
-                "times_s": [self._time_s, self._wind_known_s, self._wind_calm_s],
+                "times_s": [self._time_s, self._wind_known_s, self._wind_calm_s, self._centre_lost_s],
             }
         )
         out["centre"] = np.frombuffer(text.encode(), np.uint8).copy()
@@ -328,7 +343,7 @@ class FieldControl:
         centre = json.loads(bytes(state["centre"]).decode())
         self._alarms = centre["alarms"]
         self._wire.rng.bit_generator.state = centre["rng"]
-        self._time_s, self._wind_known_s, self._wind_calm_s = centre["times_s"]
+        self._time_s, self._wind_known_s, self._wind_calm_s, self._centre_lost_s = centre["times_s"]
         self._heliostats.forget_derived()
 
     def _names(self) -> list[tuple[str, object, str]]:
@@ -356,7 +371,15 @@ class FieldControl:
         if not 0 <= cluster < len(self._wire.alive):
             raise InvalidInputError(f"`cluster` must be 0 … {len(self._wire.alive) - 1}, got {cluster}")
 
+    def _check_centre(self) -> None:
+        if self._centre_lost_s is not None:
+            raise InvalidInputError(
+                f"the centre is dead since {self._centre_lost_s:g} s and orders nothing; repair_centre() first"
+            )
+
     def _centre_refuses(self, command: Event) -> str | None:
+        if self._centre_lost_s is not None:
+            return f"{command.name} refused: the centre is dead since {self._centre_lost_s:g} s"
         if self._alarms and command not in _ALLOWED_IN_ALARM:
             name, since = next(iter(self._alarms.items()))
             return f"{command.name} refused: {name} since {since:g} s; only stow is possible"
@@ -380,7 +403,7 @@ class FieldControl:
             self._alarms[name] = self._time_s
             weaker = [_SAFETY.get(Event(p), 0) < _SAFETY[command] if p != NOTHING else True for p in range(-1, 11)]
             to = np.array(weaker)[self._wire.pending + 1]
-            self._wire.send(command, to, self._time_s, urgent=True)
+            self._wire.send(command, to, self._time_s, urgent=True, from_centre=self._centre_lost_s is None)
 
     def _watch_wind(self, wind_m_s: float) -> None:
         now, settings = self._time_s, self.settings

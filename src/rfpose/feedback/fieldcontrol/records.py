@@ -35,6 +35,8 @@ class FieldSettings:
         Heliostats of a bus go to stow this much after each other, so that not all motors start at once [s].
     watchdog_intervals
         Control intervals without a message after which a heliostat defocuses by itself.
+    centre_silence_s
+        Time without the centre after which clusters defocus and stow their heliostats by themselves [s].
     defocus_offset_m
         Sideways from the aim point, level [m].
     calibration_places
@@ -69,6 +71,7 @@ class FieldSettings:
     emergency_hold_s: float = 30.0
     stow_stagger_s: float = 0.5
     watchdog_intervals: float = 3.0
+    centre_silence_s: float = 30.0
     defocus_offset_m: float = 15.0
     calibration_places: int = 1
     search_step_m: float = 1.0

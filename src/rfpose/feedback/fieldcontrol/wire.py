@@ -95,14 +95,15 @@ class Wire:
         self.arrival_s = np.full((3, n), np.inf)
         self.fate = np.zeros((2, n), np.int8)
 
-    def send(self, command: Event, to: BoolArray, now_s: float, *, urgent: bool) -> None:
+    def send(self, command: Event, to: BoolArray, now_s: float, *, urgent: bool, from_centre: bool = True) -> None:
         """Put an order on its way: the centre repeats it to each cluster until that has it."""
         fresh = to & (self.pending != command)
         if not fresh.any():
             return
         bus = self.bus
         tries = self.rng.geometric(1.0 - bus.failing, len(self.alive)) - 1
-        at_cluster_s = (now_s + bus.packet_s + bus.central_retry_s * tries)[self.cluster]
+        travel_s = bus.packet_s + bus.central_retry_s * tries if from_centre else np.zeros(len(self.alive))
+        at_cluster_s = (now_s + travel_s)[self.cluster]
         self.pending[fresh] = command
         self.pending_s[fresh] = at_cluster_s[fresh]
         self.done[fresh] = False
@@ -212,9 +213,7 @@ class Wire:
         axis = np.nan_to_num(self.heliostats.axis_rad[index])
         self.reported_axis_rad[index] = packets.angles_from_counts(packets.counts_from_angles(axis))
         self.reported_s[index] = at_s
-        done = index[self.done[index]]
-        self.pending[done] = NOTHING
-        self.done[done] = False
+        self.pending[index[self.done[index]]] = NOTHING
 
     def _obey(self, index: npt.NDArray[np.int64], now_s: float) -> None:
         """Do what is ordered, once: the time stamp tells a repeated order."""
