@@ -1,5 +1,33 @@
-"""The servo that follows the sun: law, stepper, margins, sensor, counts of motor moves."""
+"""The servo that follows the sun: law, stepper, margins, response in time, counts of motor moves, rules of thumb."""
 
 from rfpose.feedback.servo.law import PiLaw, ServoState, Stepper, servo_step
+from rfpose.feedback.servo.margins import (
+    Margins,
+    check_law,
+    design_law,
+    is_stable,
+    limit_cycle_rad,
+    margins,
+    sensitivity,
+    velocity_error_rad,
+)
+from rfpose.feedback.servo.response import MotorCounts, Response, count_motor, run_loop
 
-__all__ = ["PiLaw", "ServoState", "Stepper", "servo_step"]
+__all__ = [
+    "Margins",
+    "MotorCounts",
+    "PiLaw",
+    "Response",
+    "ServoState",
+    "Stepper",
+    "check_law",
+    "count_motor",
+    "design_law",
+    "is_stable",
+    "limit_cycle_rad",
+    "margins",
+    "run_loop",
+    "sensitivity",
+    "servo_step",
+    "velocity_error_rad",
+]
