@@ -154,7 +154,13 @@ def _edge(inside: npt.NDArray[np.bool_]) -> int | None:
     return int(np.argmax(run)) - 1
 
 
-def find_beam(image: npt.ArrayLike, target_px: npt.ArrayLike, plate: Plate | None = None) -> Spot:
+def find_beam(
+    image: npt.ArrayLike,
+    target_px: npt.ArrayLike,
+    plate: Plate | None = None,
+    *,
+    dark: npt.ArrayLike | None = None,
+) -> Spot:
     """Find a heliostat's image as the largest bright figure of a picture; its box's middle is its centre.
 
     Parameters
@@ -165,6 +171,8 @@ def find_beam(image: npt.ArrayLike, target_px: npt.ArrayLike, plate: Plate | Non
         Of `find_target_px`.
     plate
         The target; left out: his.
+    dark : (row, column)
+        The picture without beam, to be taken off: needed where the low sun on the tower is as bright as the beam.
 
     Notes
     -----
@@ -176,6 +184,9 @@ def find_beam(image: npt.ArrayLike, target_px: npt.ArrayLike, plate: Plate | Non
     grey = as_grey(image)
     if grey.shape != plan.shape_px:
         return no_spot(SpotStatus.WRONG_SIZE, f"{grey.shape} pixels, wanted {plan.shape_px}")
+    full = grey >= 255.0
+    if dark is not None:
+        grey = grey - as_grey(dark)
     usual, brightest = float(np.percentile(grey, 95.0)), float(grey.max())
     if brightest - usual < _LEAST_CONTRAST:
         return no_spot(SpotStatus.NO_SPOT, f"nothing brighter than the target: {brightest:.0f} against {usual:.0f}")
@@ -186,7 +197,7 @@ def find_beam(image: npt.ArrayLike, target_px: npt.ArrayLike, plate: Plate | Non
     if area[best] < _LEAST_AREA_PX:
         return no_spot(SpotStatus.NO_SPOT, f"single bright pixels only, {area[best]} at most together")
     mask = labels == best
-    clipped = float(np.mean(grey[mask] >= 255.0))
+    clipped = float(np.mean(full[mask]))
     if clipped > _SATURATED_PART:
         return no_spot(SpotStatus.SATURATED, f"{100 * clipped:.0f} % of the beam is at full scale; expose less")
     second = int(np.sort(area)[-2])
@@ -250,6 +261,7 @@ def correct_offset(
     mm_per_step: npt.ArrayLike,
     *,
     plate: Plate | None = None,
+    dark: npt.ArrayLike | None = None,
     max_correction: int = 4,
 ) -> Correction:
     """Centre a beam on the target by successive corrections.
@@ -264,6 +276,8 @@ def correct_offset(
         Right for a step of azimuth, up for one of elevation, of the beam [mm].
     plate
         The target; left out: his.
+    dark : (row, column)
+        As for `find_beam`.
     max_correction
         Give up after so many.
     """
@@ -274,7 +288,7 @@ def correct_offset(
     seen: list[FloatArray] = []
     status = CorrectionStatus.NOT_SETTLED
     for _ in range(max_correction + 1):
-        spot = find_beam(take_picture(steps), target_px, plate)
+        spot = find_beam(take_picture(steps), target_px, plate, dark=dark)
         if spot.status != SpotStatus.OK:
             status = CorrectionStatus.NOT_SEEN
             break

@@ -244,7 +244,7 @@ def _markers(target: Target, x: FloatArray, y: FloatArray) -> npt.NDArray[np.boo
 def _reflectance(target: Target, x: FloatArray, y: FloatArray) -> FloatArray:
     """How much of a beam comes back from each point: all from the target, a fifth from the tower."""
     on = (np.abs(x) < 0.5 * target.width_m) & (np.abs(y) < 0.5 * target.height_m)
-    return np.where(_markers(target, x, y), 0.05, np.where(on, 1.0, 0.2))
+    return np.asarray(np.where(_markers(target, x, y), 0.05, np.where(on, 1.0, 0.2)))
 
 
 def _flux(beam: Beam, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -276,4 +276,4 @@ def _flare(shape_px: tuple[int, int]) -> FloatArray:
     light = 0.5 * np.exp(-2.0 * np.hypot(down, left))
     for part, size in ((0.25, 0.05), (0.8, 0.08)):
         light += 0.5 * np.exp(-0.5 * ((down - part) ** 2 + (left - part) ** 2) / size**2)
-    return light
+    return np.asarray(light)
