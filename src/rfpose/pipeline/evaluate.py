@@ -19,7 +19,7 @@ from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.noise import phase_noise
-from rfpose.pipeline.result_file import Result, count_reasons, is_result, read_result
+from rfpose.pipeline.result_file import EXPLAINED, Result, count_reasons, is_result, read_result
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
@@ -344,9 +344,11 @@ def _protection(result: Result, normal_error: FloatArray) -> Protection | None:
     level = result.integrity.protection_level_rad
     covered = np.isfinite(level) & np.isfinite(normal_error)
     exceeded = covered & (normal_error > level)
+    explained = np.isin(result.integrity.status, EXPLAINED)
+    left_out = result.integrity.transmitter_status[explained] > TransmitterStatus.NOT_RECEIVED
     return Protection(
         level_mrad=Statistics.of(1e3 * level[covered]),
         covered=int(np.count_nonzero(covered)),
         exceeded=int(np.count_nonzero(exceeded)),
-        excluded=int(np.count_nonzero(result.integrity.transmitter_status > TransmitterStatus.NOT_RECEIVED)),
+        excluded=int(np.count_nonzero(left_out)),
     )

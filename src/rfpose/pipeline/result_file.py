@@ -58,6 +58,9 @@ VERSION = 1
 NEEDED_PROBABILITY = 1e-3
 """Residuals of the direct ray alone that are rarer than this say that a reflection is needed."""
 
+EXPLAINED = (IntegrityStatus.EXCLUDED, IntegrityStatus.PRIOR_REJECTED, IntegrityStatus.AMBIGUOUS)
+"""Where what was left out explains the residuals; elsewhere its names mean nothing."""
+
 StatusArray = npt.NDArray[np.int8]
 
 
@@ -583,8 +586,9 @@ def summarise(result: Result) -> dict[str, Any]:
 
 def _summary_of_integrity(result: Result, table: IntegrityTable) -> dict[str, Any]:
     excluded = {}
+    explained = np.isin(table.status, EXPLAINED)
     for i, name in enumerate(result.scenario.transmitter_ids):
-        status = table.transmitter_status[..., i]
+        status = np.where(explained, table.transmitter_status[..., i], 0)
         reasons = count_reasons(np.where(status > TransmitterStatus.NOT_RECEIVED, status, 0), TransmitterStatus)
         if reasons:
             excluded[name] = reasons

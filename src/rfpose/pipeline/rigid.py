@@ -171,7 +171,7 @@ def _direct(stages: _Stages, group: MirrorGroup) -> _Found:
     at, at_rot = _or(ladder.poses.pivot_enu_m, start), _or(ladder.poses.rot_enu_from_mirror, rot)
     guard = _joined(first, _guard(scenario, places, found.ranges, at, at_rot, known))
     status = _pose_status(guard.poses.status)
-    status[(status == PoseStatus.OK) & (guard.status == IntegrityStatus.UNEXPLAINED)] = PoseStatus.UNEXPLAINED
+    status[(status == PoseStatus.OK) & _doubted(guard)] = PoseStatus.UNEXPLAINED
     return replace(
         found,
         poses=guard.poses,
@@ -282,14 +282,15 @@ def _two_ray(stages: _Stages, group: MirrorGroup) -> _Found:
     n_frame, n_helio = len(stages.tones.frame_start_index), len(group.column)
     places, start, rot, phases = _inputs(stages, group)
     known = group.knowledge(scenario, n_frame)
-    start, rot = _better_start(scenario, places, phases, start, rot, known)
+    surveyed = np.tile(group.pivot_enu_m, (n_frame, 1))
+    start, rot = _better_start(scenario, places, phases, start, rot, surveyed, known)
     row = np.arange(n_frame * n_helio).reshape(n_frame, n_helio)
     shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
     parts = []
     for rows in shared:
         mine = known if known.pivot_enu_m is None else replace(known, pivot_enu_m=known.pivot_enu_m[rows])
         these = [_taken(o, rows) for o in phases]
-        parts.append(_two_ray_of(stages, places[rows], these, start[rows], rot[rows], mine))
+        parts.append(_two_ray_of(stages, places[rows], these, start[rows], rot[rows], mine, rows % n_helio))
     return _in_order(parts, np.argsort(np.concatenate(shared)), known)
 
 
@@ -299,9 +300,13 @@ def _better_start(
     phases: list[Observation],
     start: FloatArray,
     rot: FloatArray,
+    surveyed: FloatArray,
     known: Knowledge,
 ) -> tuple[FloatArray, FloatArray]:
-    """Start from rigid poses by the direct ray; separately located receivers are too far off where ground reflects."""
+    """Start from surveyed pivots, whatever their sigma, and from orientations by the direct ray.
+
+    Receivers located each on its own are metres off where the ground reflects.
+    """
     coarse = phases[0]
     poses = solve_rigid(
         scenario.transmitter_enu_m,
@@ -314,10 +319,8 @@ def _better_start(
         start_rot_enu_from_mirror=rot,
         knowledge=known,
     )
-    pivot = _or(poses.pivot_enu_m, start)
-    if known.pivot_enu_m is not None:
-        pivot = np.where(np.isfinite(pivot), known.pivot_enu_m, np.nan)
-    return pivot, _or(poses.rot_enu_from_mirror, rot)
+    rot = _or(poses.rot_enu_from_mirror, rot)
+    return np.where(np.isfinite(rot).all(axis=2), surveyed, np.nan), rot
 
 
 def _two_ray_of(
@@ -327,6 +330,7 @@ def _two_ray_of(
     start: FloatArray,
     rot: FloatArray,
     known: Knowledge,
+    helio: IntArray,
 ) -> _Found:
     """Solve mirrors that share their coefficients; where a test finds something to leave out, once more without."""
     table = stages.scenario.integrity
@@ -339,7 +343,11 @@ def _two_ray_of(
             max_excluded=table.max_excluded,
         )
 
+    before = rot
     solution = _solve_ground(stages, places, phases, start, rot, known)
+    start, rot = _again(stages, solution, helio, places, phases, start, rot, known)
+    if not np.array_equal(rot, before):
+        solution = _solve_ground(stages, places, phases, start, rot, known)
     probability_all, probability_direct = solution.probability, solution.probability_direct
     guard: GuardedPoses | None = None
     if stages.choice.integrity:
@@ -354,7 +362,7 @@ def _two_ray_of(
     if guard is not None:
         explained = np.isfinite(guard.protection_level_rad) | (guard.status == IntegrityStatus.NO_REDUNDANCY)
         status[(status == PoseStatus.UNEXPLAINED) & explained] = PoseStatus.OK
-        status[(status == PoseStatus.OK) & (guard.status == IntegrityStatus.UNEXPLAINED)] = PoseStatus.UNEXPLAINED
+        status[(status == PoseStatus.OK) & _doubted(guard)] = PoseStatus.UNEXPLAINED
     n, n_plane = len(places), len(solution.coefficient)
     sigma = np.zeros((n_plane, 2))
     estimated = [p for p, r in enumerate(reflectors_of(stages.scenario, stages.choice.reflection)) if r.estimated]
@@ -375,6 +383,47 @@ def _two_ray_of(
     )
 
 
+def _again(
+    stages: _Stages,
+    solution: GroundSolution,
+    helio: IntArray,
+    places: FloatArray,
+    phases: list[Observation],
+    start: FloatArray,
+    rot: FloatArray,
+    known: Knowledge,
+) -> tuple[FloatArray, FloatArray]:
+    """Return better poses to begin with for mirrors that ended in a false minimum, where any mirror did not.
+
+    With the coefficients of those that fit, each other one is tried from the same mirror's pose in another frame, or
+    around where it began.
+    """
+    good = solution.status == GroundStatus.OK
+    lost = np.flatnonzero(np.isin(solution.status, (GroundStatus.RESIDUAL, GroundStatus.NOT_CONVERGED)))
+    if not lost.size or not good.any():
+        return start, rot
+    pivot, turned = start.copy(), rot.copy()
+    pivot[good], turned[good] = solution.poses.pivot_enu_m[good], solution.poses.rot_enu_from_mirror[good]
+    for m in lost:
+        frames = np.flatnonzero(good & (helio == helio[m]))
+        if frames.size:
+            nearest = frames[np.argmin(np.abs(frames - m))]
+            pivot[m], turned[m] = pivot[nearest], turned[nearest]
+    mine = known if known.pivot_enu_m is None else replace(known, pivot_enu_m=known.pivot_enu_m[lost])
+    found = _solve_ground(
+        stages,
+        places[lost],
+        [_taken(o, lost) for o in phases],
+        pivot[lost],
+        turned[lost],
+        mine,
+        coefficient=solution.coefficient,
+    )
+    fits = found.status == GroundStatus.OK
+    pivot[lost[fits]], turned[lost[fits]] = found.poses.pivot_enu_m[fits], found.poses.rot_enu_from_mirror[fits]
+    return pivot, turned
+
+
 def _solve_ground(
     stages: _Stages,
     places: FloatArray,
@@ -382,8 +431,13 @@ def _solve_ground(
     start: FloatArray,
     rot: FloatArray,
     known: Knowledge,
+    *,
+    coefficient: npt.NDArray[np.complex128] | None = None,
 ) -> GroundSolution:
     scenario = stages.scenario
+    reflectors = reflectors_of(scenario, stages.choice.reflection)
+    if coefficient is not None:
+        reflectors = tuple(replace(r, coefficient=complex(c)) for r, c in zip(reflectors, coefficient, strict=True))
     return solve_with_ground(
         scenario.transmitter_enu_m,
         places,
@@ -391,7 +445,7 @@ def _solve_ground(
         carrier_rf_hz=carrier_rf_hz(scenario),
         start_pivot_enu_m=start,
         start_rot_enu_from_mirror=rot,
-        reflectors=reflectors_of(scenario, stages.choice.reflection),
+        reflectors=reflectors,
         calibration_enu_m=scenario.calibration_enu_m,
         calibration_share=calibration_share(stages.tones.sigma_rad, scenario),
         tone_count=len(scenario.tone),
@@ -456,6 +510,15 @@ def _pose_status(status: IntArray) -> IntArray:
 def _probability(poses: RigidPoses) -> FloatArray:
     with np.errstate(invalid="ignore"):
         return np.asarray(chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)))
+
+
+def _doubted(guard: GuardedPoses) -> BoolArray:
+    """(mirror,) not explained, or explained by leaving out so much that nothing confirms it."""
+    left_out = (guard.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) | guard.prior_rejected.any(
+        axis=1
+    )
+    unconfirmed = left_out & (guard.status == IntegrityStatus.NO_REDUNDANCY)
+    return np.asarray((guard.status == IntegrityStatus.UNEXPLAINED) | unconfirmed)
 
 
 def _keep(phases: list[Observation], used: BoolArray) -> list[Observation]:

@@ -22,6 +22,7 @@ from rfpose.multilat.integrity.hypotheses import (
     limit,
     log_probability,
     noncentrality,
+    quiet_median,
     tilt_quantile,
 )
 from rfpose.multilat.rigid import RigidPoses, RigidStatus
@@ -212,7 +213,7 @@ class _Guard:
             TransmitterStatus.ONE_RECEIVER,
             np.where(apart < _ALIKE * size, TransmitterStatus.COMMON_ERROR, TransmitterStatus.MULTIPATH),
         )
-        usual = np.nanmedian(every, axis=(2, 3))
+        usual = quiet_median(every.reshape(*every.shape[:2], -1))
         noisy = np.any(np.nan_to_num(sigma) > NOISY * usual[:, :, None], axis=(1, 2))
         return np.asarray(np.where(noisy, TransmitterStatus.INTERFERENCE, cause), np.int64)
 

@@ -20,6 +20,7 @@ from rfpose.multilat.integrity.hypotheses import (
     limit,
     log_probability,
     noncentrality,
+    quiet_median,
     tilt_quantile,
 )
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, solve_rigid
@@ -413,7 +414,7 @@ class _Guard:
         left, sigma = self._left(rows, who)
         free = np.isinf(sigma)
         own = self.original[rows, :, :, who]
-        middle = _median(np.where(own > 0.0, left, np.nan))[..., None]
+        middle = quiet_median(np.where(own > 0.0, left, np.nan))[..., None]
         left = np.where(free, left - middle, left)
         size = np.where(own > 0.0, np.abs(left), 0.0)
         with np.errstate(divide="ignore"):
@@ -508,7 +509,7 @@ class _Guard:
         weight = self.problem.weight[rows]
         with np.errstate(divide="ignore"):
             sigma = np.where(weight > 0.0, weight**-0.5, np.nan)
-        usual = _median(sigma.reshape(*sigma.shape[:2], -1))
+        usual = quiet_median(sigma.reshape(*sigma.shape[:2], -1))
         own = sigma[np.arange(len(rows)), :, :, who]
         return np.asarray((own > NOISY * usual[:, :, None]).any(axis=(1, 2)))
 
@@ -608,15 +609,6 @@ class _Guard:
         apart = np.linalg.norm(self.other_normal - normal, axis=-1)
         level = np.where(moot, np.nan, apart + tilt_quantile(self.missed) * self.other_sigma)
         return np.asarray(np.fmax.reduce(level, axis=1))
-
-
-def _median(x: FloatArray) -> FloatArray:
-    """Median over the last axis without NaN; NaN where nothing is left."""
-    ordered = np.sort(x, axis=-1)  # NaN last
-    count = np.isfinite(x).sum(axis=-1)
-    low, high = (np.maximum(k, 0)[..., None] for k in ((count - 1) // 2, np.minimum(count // 2, x.shape[-1] - 1)))
-    middle = 0.5 * (np.take_along_axis(ordered, low, -1) + np.take_along_axis(ordered, high, -1))[..., 0]
-    return np.asarray(np.where(count > 0, middle, np.nan))
 
 
 def _sigma(bias_info: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ __all__ = [
     "limit",
     "log_probability",
     "noncentrality",
+    "quiet_median",
     "tilt_quantile",
 ]
 
@@ -98,16 +99,13 @@ class Problem:
         info[:, range(3), range(3)] += (has[:, 0] / self.known.pivot_sigma_m**2)[:, None]
         turn = np.stack([rot[:, 1, 0], -rot[:, 0, 0]], axis=-1) / self.known.roll_sigma_rad
         info[:, 3:5, 3:5] += has[:, 1, None, None] * turn[:, :, None] * turn[:, None, :]
-        largest = np.maximum(self.weight.max(axis=(1, 2, 3)), 1e-300)
-        tie = (
-            has[:, 2] / np.maximum(self.known.clock_sigma_m**2, _TIE_FLOOR / largest)
-            if has[:, 2].any()
-            else 0 * largest
-        )
         apart = np.eye(n_receiver) - 1.0 / n_receiver
         for k in range(n_class):
             clocks = slice(6 + k * n_receiver, 6 + (k + 1) * n_receiver)
-            info[:, clocks, clocks] += tie[:, None, None] * apart
+            largest = np.maximum(self.weight[:, self.classes == k].max(axis=(1, 2, 3)), 1e-300)
+            if has[:, 2].any():
+                tie = has[:, 2] / np.maximum(self.known.clock_sigma_m**2, _TIE_FLOOR / largest)
+                info[:, clocks, clocks] += tie[:, None, None] * apart
             calibrated = np.any(self.bias_info[:, self.classes == k] > 0.0, axis=(1, 2))
             info[:, clocks.start, clocks.start] += np.where(calibrated, 0.0, largest)
         return info
@@ -281,3 +279,12 @@ def largest_eigenvalue(matrix: FloatArray) -> FloatArray:
 def tilt_quantile(probability: float) -> float:
     """How many of its larger sigmas a two-dimensional normal error exceeds with at most ``probability``."""
     return float(np.sqrt(-2.0 * np.log(probability)))
+
+
+def quiet_median(x: FloatArray) -> FloatArray:
+    """Median over the last axis without NaN; NaN where nothing is left."""
+    ordered = np.sort(x, axis=-1)  # NaN last
+    count = np.isfinite(x).sum(axis=-1)
+    low, high = (np.maximum(k, 0)[..., None] for k in ((count - 1) // 2, np.minimum(count // 2, x.shape[-1] - 1)))
+    middle = 0.5 * (np.take_along_axis(ordered, low, -1) + np.take_along_axis(ordered, high, -1))[..., 0]
+    return np.asarray(np.where(count > 0, middle, np.nan))

@@ -60,21 +60,21 @@ def clock_ties(
     transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says nothing.
     """
     n_mirror, _, n_receiver, _ = weight.shape
-    # each mirror's own scale, so that no mirror's result depends on its neighbours
-    largest = np.maximum(weight.max(axis=(1, 2, 3), initial=0.0), 1e-300)
     own = np.zeros((n_mirror, n_class, n_receiver))
+    tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
     for k in range(n_class):
+        # each mirror's and class's own scale: no mirror's result depends on its neighbours, and the stiffest tie of a
+        # coarse tone stays comparable with what that tone observes
+        largest = np.maximum(weight[:, classes == k].max(axis=(1, 2, 3), initial=0.0), 1e-300)
         known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
         own[:, k, 0] = np.where(known, 0.0, largest)
         # a clock that nothing observes is held as well; it takes part in nothing
         seen = np.any(weight[:, classes == k] > 0.0, axis=(1, 3))
         if np.isfinite(clock_sigma_m):
             own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
+            tie[:, k] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None]
         else:
             own[:, k] = np.where(seen, own[:, k], largest[:, None])
-    tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
-    if np.isfinite(clock_sigma_m):
-        tie[:] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None, None]
     return own, tie
 
 

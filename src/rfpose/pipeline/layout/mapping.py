@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.layout import maps
+from rfpose.layout.budget import make_plan, noise_bound
 from rfpose.layout.maps import ESTIMATORS, Estimator, Mirrors, Noise, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
@@ -23,6 +25,9 @@ from rfpose.pipeline.pictures import _mark, _new_figure, _save
 from rfpose.scenario import Scenario
 
 __all__ = ["LayoutMap", "SightMap", "draw_layout_map", "map_layout", "write_layout_csv"]
+
+REFLECTION = "reflection"
+"""The scenario's own solver, the ground's coefficient estimated with the poses; where ``[simulation.ground]`` is."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -145,7 +150,7 @@ def _sensitivity_dict(ids: tuple[str, ...], found: TransmitterSensitivity) -> di
 def map_layout(
     scenario_path: str | Path,
     *,
-    estimators: Sequence[str] = tuple(ESTIMATORS),
+    estimators: Sequence[str] = (*ESTIMATORS, REFLECTION),
     suns_deg: Sequence[Sun] = (),
     postures: Postures | None = None,
     field_csv: str | Path | None = None,
@@ -160,7 +165,8 @@ def map_layout(
     scenario_path
         TOML.
     estimators
-        Names out of `rfpose.layout.maps.ESTIMATORS`.
+        Names out of `rfpose.layout.maps.ESTIMATORS`, and ``reflection``: the scenario's own solver with the
+        ground's coefficient estimated, where the scenario has a ground and line of sight is not asked for.
     suns_deg
         Azimuth and elevation of suns; short for ``postures``.
     postures
@@ -192,7 +198,13 @@ def map_layout(
     )
     dilution = maps.dilution(transmitter, scenario.pivot_enu_m)
     rms, worst, by_posture, undetermined, lost, response = {}, {}, {}, {}, {}, {}
+    if scenario.simulation.ground is not None and sight is None and REFLECTION in estimators:
+        sigma = 1e3 * np.array([_with_reflection(scenario, p, scenario_path) for p in studied])
+        rms[REFLECTION], by_posture[REFLECTION] = _rms(sigma, 0), _rms(sigma, 1)
+        worst[REFLECTION], undetermined[REFLECTION] = sigma.max(axis=0), float(np.isnan(sigma).mean())
     for name in estimators:
+        if name == REFLECTION:
+            continue
         estimator = ESTIMATORS[name]
         sigma = 1e3 * np.array(
             [
@@ -227,6 +239,16 @@ def map_layout(
         sight=None if seen is None else _sight_map(np.array(seen)),
         sensitivity=response,
     )
+
+
+def _with_reflection(scenario: Scenario, posture: Posture, path: str | Path) -> FloatArray:
+    """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
+    data = scenario.model_dump(exclude_none=True)
+    data["budget"] = {**data.get("budget", {}), "ground": "estimated"}
+    try:
+        return noise_bound(make_plan(Scenario.model_validate(data), posture.mirrors))
+    except (GeometryError, InvalidInputError) as error:
+        raise ScenarioError(f"{path}: {error}") from error
 
 
 def _rms(sigma: FloatArray, axis: int) -> FloatArray:
