@@ -119,6 +119,18 @@ def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
     assert behind["seen_mean"] + sight["seen_mean"] == pytest.approx(10.0, abs=0.5)
 
 
+def test_map_with_the_reflection_estimated(tmp_path):
+    ground = "ground = { coefficient = [-0.3, 0.1] }\n"
+    site = broken(tmp_path, "[simulation]\n", "[simulation]\n" + ground)
+    found = json.loads(run("map", site, "--json", "--estimator", "reflection", "--estimator", "delays"))["normal_mrad"]
+    budget = budget_layout(site, ground="estimated", n_draw=0).as_dict()["lines"]
+    noise = ("thermal noise", "quantisation", "calibration noise")
+    total = np.sqrt(sum(line["normal_mrad"] ** 2 for line in budget if line["source"] in noise))
+    assert found["reflection"]["rms"] == pytest.approx(total)
+    # the ground is one more unknown and one more look at the mirror: of the same order as without it
+    assert 0.3 < found["reflection"]["rms"] / found["delays"]["rms"] < 30.0
+
+
 def test_map_says_what_each_transmitter_means():
     found = json.loads(run("map", SITE, "--json", "--estimator", "rigid", "--sensitivity"))
     one = found["sensitivity"]["rigid"]

@@ -5,7 +5,8 @@ import pytest
 
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS, Estimator, Noise, dilution, mirrors_facing, normal_map
-from rfpose.layout.optimise import CRITERIA, _rows
+from rfpose.layout.optimise import CRITERIA
+from rfpose.layout.optimise.search import _rows
 from rfpose.multilat import dop, normal_bound, position_bound
 from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
@@ -62,6 +63,7 @@ def test_independent_bound(mirrors, calibration):
         (ESTIMATORS["rigid"], {}),
         (ESTIMATORS["shared-clock"], {"clock_sigma_m": 0.0}),
         (ESTIMATORS["carrier"], {"clock_sigma_m": 0.0}),
+        (ESTIMATORS["delays"], {}),
         (ESTIMATORS["pivot"], {"clock_sigma_m": 0.0, "pivot_sigma_m": 0.005}),
         (
             Estimator(name="tied", clock_sigma_m=2e-3, two_axis=True, roll_sigma_rad=1e-3),

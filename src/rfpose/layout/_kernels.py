@@ -1,4 +1,4 @@
-"""Kernels of layout studies: dilution, bounds of normals with their gradients, occlusion.
+"""Kernels of sensitivity maps: dilution, bounds of normals.
 
 Arrays of transmitters are (xyz, transmitter), so that sums over transmitters vectorise. ``visible`` is (mirror,
 receiver, transmitter), or has no rows when everything is seen. A mirror whose pose is not determined gives NaN.
@@ -19,8 +19,8 @@ from rfpose.jit import kernel, kernel_parallel
 FLOOR = 1e-13
 # det M below this part of (tr M)³ means a plane or a line, as in `rfpose.multilat`.
 SINGULAR_DET = 1e-12
-
-DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
+# Points taken side by side.
+BLOCK = 16
 
 Array = npt.NDArray[np.float64]
 
@@ -180,28 +180,59 @@ def row_weights(weight, inverse, range2, visible, seen_all, w):
 
 
 @kernel
+def dop_sums(transmitter, weight, visible, point, first, n, sums):
+    """Sums over transmitters of w (1, u, u uᵀ) for BLOCK points from ``first`` on, the last one repeated; (sum, point).
+
+    Points side by side, so that the inner loop vectorises in plain arithmetic.
+    """
+    seen_all = visible.shape[0] == 0
+    sums[:] = 0.0
+    px, py, pz, w = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK)
+    for k in range(BLOCK):
+        i = first + min(k, n - 1)
+        px[k], py[k], pz[k] = point[i, 0], point[i, 1], point[i, 2]
+    for t in range(transmitter.shape[1]):
+        tx, ty, tz = transmitter[0, t], transmitter[1, t], transmitter[2, t]
+        for k in range(BLOCK):
+            w[k] = weight[t]
+        if not seen_all:
+            for k in range(BLOCK):
+                w[k] *= visible[first + min(k, n - 1), t]
+        for k in range(BLOCK):
+            x, y, z = px[k] - tx, py[k] - ty, pz[k] - tz
+            a = 1.0 / math.sqrt(x * x + y * y + z * z)
+            x *= a
+            y *= a
+            z *= a
+            sums[0, k] += w[k]
+            sums[1, k] += w[k] * x
+            sums[2, k] += w[k] * y
+            sums[3, k] += w[k] * z
+            sums[4, k] += w[k] * x * x
+            sums[5, k] += w[k] * x * y
+            sums[6, k] += w[k] * x * z
+            sums[7, k] += w[k] * y * y
+            sums[8, k] += w[k] * y * z
+            sums[9, k] += w[k] * z * z
+
+
+@kernel
 def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
     """Do rows ``begin`` to ``end`` of `dop_rows`."""
-    n_transmitter = transmitter.shape[1]
-    seen_all = visible.shape[0] == 0
-    m = np.empty((3, 3))
-    q = np.empty((3, 3))
-    s = np.empty(4)
-    u = np.empty((3, n_transmitter))
-    inverse = np.empty(n_transmitter)
-    w = weight.copy()
-    for i in range(begin, end):
-        x, y, z = point[i, 0], point[i, 1], point[i, 2]
-        if not seen_all:
-            for t in range(n_transmitter):
-                w[t] = weight[t] * visible[i, t]
-        directions(transmitter, x, y, z, u, inverse)
-        moments(u, w, s, m)
-        centre(s, m)
-        if invert(m, q):
-            out[i, 0] = q[0, 0]
-            out[i, 1] = q[1, 1]
-            out[i, 2] = q[2, 2]
+    m, q, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
+    sums = np.empty((10, BLOCK))
+    for first in range(begin, end, BLOCK):
+        n = min(BLOCK, end - first)
+        dop_sums(transmitter, weight, visible, point, first, n, sums)
+        for k in range(n):
+            s[3], s[0], s[1], s[2] = sums[0, k], sums[1, k], sums[2, k], sums[3, k]
+            m[0, 0], m[0, 1], m[0, 2] = sums[4, k], sums[5, k], sums[6, k]
+            m[1, 1], m[1, 2], m[2, 2] = sums[7, k], sums[8, k], sums[9, k]
+            centre(s, m)
+            if invert(m, q):
+                out[first + k, 0] = q[0, 0]
+                out[first + k, 1] = q[1, 1]
+                out[first + k, 2] = q[2, 2]
 
 
 @kernel_parallel
@@ -587,203 +618,3 @@ def tilt_rigid(field, weight, bias_info, group_class, n_class, shared, tie, pivo
         tilt_rigid_part(
             begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out
         )
-
-
-@kernel
-def objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient):
-    """Do rows ``begin`` to ``end`` of `objective_rows`."""
-    n_transmitter = field.transmitter.shape[1]
-    n_receiver = 1 if method == DOP else field.place.shape[1]
-    pivot, rot = field.pivot, field.rot
-    size = 3 if method <= INDEPENDENT else 6
-    u = np.empty((n_receiver, 3, n_transmitter))
-    inverse = np.empty((n_receiver, n_transmitter))
-    row = np.empty((n_receiver, n_transmitter, 6))
-    arm = np.zeros((n_receiver, 3))
-    jac = np.empty((n_receiver, 3, 3))
-    mean = np.empty((n_receiver, 6))
-    info = np.empty((6, 6))
-    weighed = np.empty((6, 6))
-    cov = np.empty((6, 6))
-    q3 = np.empty((3, 3))
-    for i in range(begin, end):
-        if method == INDEPENDENT:
-            turn_slopes(rot[i], plane_slope[i % plane_slope.shape[0]], jac)
-        for r in range(n_receiver):
-            if method == DOP:
-                directions(field.transmitter, pivot[i, 0], pivot[i, 1], pivot[i, 2], u[r], inverse[r])
-            else:
-                look(field, i, r, arm[r], u[r], inverse[r])
-        fill_rows(u, arm, weight, size, method == SHARED, row, mean)
-        value[i] = 0.0
-        info[:] = 0.0
-        for r in range(n_receiver):
-            if size == 3:
-                info[:] = 0.0
-            for t in range(n_transmitter):
-                for a in range(size):
-                    f = weight[t] * row[r, t, a]
-                    for b in range(a + 1):
-                        info[a, b] += f * row[r, t, b]
-            if size == 3:
-                mirror_up(info, 3)
-                if not invert(info, q3):
-                    value[i] = np.nan
-                    break
-                value[i] += weigh_position(method, q3, jac[r], weighed)
-                add_gradient(r, 3, weight, row, u, inverse, arm, weighed, gradient[i])
-        if size == 6:
-            mirror_up(info, 6)
-            if not invert_spd(info, 6, cov):
-                value[i] = np.nan
-                continue
-            value[i] = weigh_rotation(cov, rot[i], weighed)
-            for r in range(n_receiver):
-                add_gradient(r, 6, weight, row, u, inverse, arm, weighed, gradient[i])
-
-
-@kernel_parallel
-def objective_rows(method, field, weight, plane_slope, n_chunk, value, gradient):
-    """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
-
-    ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
-    Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
-    """
-    for chunk in numba.prange(n_chunk):
-        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
-        objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient)
-
-
-@kernel
-def fill_rows(u, arm, weight, size, shared, row, mean):
-    """Rows of the Jacobian less their mean: over the receiver's transmitters, or over all where a clock is shared."""
-    n_receiver, n_transmitter = row.shape[0], row.shape[1]
-    total = 0.0
-    for t in range(n_transmitter):
-        total += weight[t]
-    for r in range(n_receiver):
-        mean[r] = 0.0
-        for t in range(n_transmitter):
-            x, y, z = u[r, 0, t], u[r, 1, t], u[r, 2, t]
-            row[r, t, 0] = x
-            row[r, t, 1] = y
-            row[r, t, 2] = z
-            row[r, t, 3], row[r, t, 4], row[r, t, 5] = torque(arm[r], x, y, z)
-            for a in range(size):
-                mean[r, a] += weight[t] / total * row[r, t, a]
-    for a in range(size):
-        if shared:
-            s = 0.0
-            for r in range(n_receiver):
-                s += mean[r, a] / n_receiver
-            for r in range(n_receiver):
-                mean[r, a] = s
-        for r in range(n_receiver):
-            for t in range(n_transmitter):
-                row[r, t, a] -= mean[r, a]
-
-
-@kernel
-def mirror_up(a, n):
-    """Fill the upper triangle from the lower."""
-    for i in range(n):
-        for j in range(i):
-            a[j, i] = a[i, j]
-
-
-@kernel
-def invert_spd(a, n, out):
-    """Set out = a⁻¹ of a positive definite matrix by Gauss-Jordan on a copy; False where it is singular."""
-    work = a[:n, :n].copy()
-    out[:n, :n] = 0.0
-    for i in range(n):
-        out[i, i] = 1.0
-    for j in range(n):
-        p = work[j, j]
-        if not p > FLOOR * a[j, j]:
-            return False
-        for k in range(n):
-            work[j, k] /= p
-            out[j, k] /= p
-        for i in range(n):
-            if i != j:
-                f = work[i, j]
-                for k in range(n):
-                    work[i, k] -= f * work[j, k]
-                    out[i, k] -= f * out[j, k]
-    return True
-
-
-@kernel
-def weigh_position(method, q, jac, weighed):
-    """Return tr(B q), and weighed = q B q, with B the identity (dilution) or jacᵀ jac (normal)."""
-    total = 0.0
-    for a in range(3):
-        for b in range(3):
-            weighed[a, b] = 0.0
-    for k in range(3):
-        # row k of jac q, or of q
-        x = y = z = 0.0
-        if method == DOP:
-            x, y, z = q[k, 0], q[k, 1], q[k, 2]
-            total += q[k, k]
-        else:
-            for c in range(3):
-                x += jac[k, c] * q[c, 0]
-                y += jac[k, c] * q[c, 1]
-                z += jac[k, c] * q[c, 2]
-            total += x * jac[k, 0] + y * jac[k, 1] + z * jac[k, 2]
-        v = (x, y, z)
-        for a in range(3):
-            for b in range(3):
-                weighed[a, b] += v[a] * v[b]
-    return total
-
-
-@kernel
-def weigh_rotation(cov, rot, weighed):
-    """Return the normal's variance, and weighed = C G C with G the rotation's part across the normal."""
-    total = 0.0
-    for a in range(6):
-        for b in range(6):
-            weighed[a, b] = 0.0
-    for axis in range(2):
-        # tilts about the mirror's x and y axes
-        for a in range(6):
-            x = 0.0
-            for c in range(3):
-                x += cov[a, 3 + c] * rot[c, axis]
-            weighed[a, a] += x * x
-            if a >= 3:
-                total += x * rot[a - 3, axis]
-            for b in range(a):
-                y = 0.0
-                for c in range(3):
-                    y += cov[b, 3 + c] * rot[c, axis]
-                weighed[a, b] += x * y
-                weighed[b, a] += x * y
-    return total
-
-
-@kernel
-def add_gradient(r, size, weight, row, u, inverse, arm, weighed, gradient):
-    """Add one receiver's part of the derivative of the variance by the transmitters' positions."""
-    v = np.empty(6)
-    for t in range(weight.shape[0]):
-        for a in range(size):
-            s = 0.0
-            for b in range(size):
-                s += weighed[a, b] * row[r, t, b]
-            v[a] = s
-        x, y, z = v[0], v[1], v[2]
-        if size == 6:
-            # (arm × du) · v = du · (v × arm)
-            x += v[4] * arm[r, 2] - v[5] * arm[r, 1]
-            y += v[5] * arm[r, 0] - v[3] * arm[r, 2]
-            z += v[3] * arm[r, 1] - v[4] * arm[r, 0]
-        along = x * u[r, 0, t] + y * u[r, 1, t] + z * u[r, 2, t]
-        # du = −(I − u uᵀ)/d dT, so the minus of −2 Σ … turns
-        f = 2.0 * weight[t] * inverse[r, t]
-        gradient[t, 0] += f * (x - along * u[r, 0, t])
-        gradient[t, 1] += f * (y - along * u[r, 1, t])
-        gradient[t, 2] += f * (z - along * u[r, 2, t])

@@ -86,10 +86,12 @@ ESTIMATORS = {
         Estimator(name="rigid"),
         Estimator(name="shared-clock", clock_sigma_m=0.0),
         Estimator(name="carrier", clock_sigma_m=0.0, carrier=True),
+        Estimator(name="delays", carrier=True),
         Estimator(name="pivot", clock_sigma_m=0.0, pivot_sigma_m=0.005),
     )
 }
-"""Ready estimators; ``pivot`` has pivots surveyed to 5 mm and a shared clock."""
+"""Ready estimators; ``delays`` compares carriers with each receiver's delay estimated in every frame, ``pivot`` has
+pivots surveyed to 5 mm and a shared clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

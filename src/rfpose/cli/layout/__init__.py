@@ -8,7 +8,7 @@ import click
 
 __all__ = ["command"]
 
-_COMMANDS = {"map": "map_command", "optimise": "optimise_command", "budget": "budget_command"}
+_COMMANDS = {"map": "map_command", "optimise": "optimise_command", "budget": "budget_command", "tones": "tones_command"}
 
 
 class _Studies(click.Group):

@@ -15,7 +15,9 @@ from rfpose.layout.budget.sources import SOURCES, Effect, Source
 from rfpose.layout.budget.world import World
 from rfpose.layout.gain import Gain
 
-__all__ = ["BudgetLine", "ErrorBudget", "error_budget", "target_slope"]
+__all__ = ["BudgetLine", "ErrorBudget", "error_budget", "noise_bound", "target_slope"]
+
+_NOISE = ("thermal noise", "quantisation", "clock", "calibration noise", "calibration survey", "pivot survey")
 
 _BATCH_RANGES = 2_000_000
 """Ranges drawn at once, for memory."""
@@ -121,6 +123,18 @@ def error_budget(
         progress(len(sources) + 1, len(sources) + 1)
     lines.sort(key=lambda line: -float(np.sum(np.nan_to_num(line.normal_rad) ** 2)))
     return ErrorBudget(lines=tuple(lines), whole=whole, n_draw=n_draw, n_failed=n_failed + failed, plan=plan)
+
+
+def noise_bound(plan: Plan) -> FloatArray:
+    """Return the rms angle of each normal (mirror,) [rad] that noise and the solver's own priors leave.
+
+    What `rfpose.layout.maps.normal_map` bounds, for any solver a plan can describe: reflections estimated, too.
+    """
+    gain = plan.gain()
+    outputs = _outputs(gain)
+    counted = [s for s in SOURCES if s.name in _NOISE and s.assumed(plan)]
+    total = np.sum([_covariance(s.effects(plan, *outputs), gain) for s in counted], axis=0)
+    return np.asarray(np.sqrt(np.trace(total, axis1=1, axis2=2)))
 
 
 def target_slope(plan: Plan, aim_enu_m: npt.ArrayLike | None) -> FloatArray:

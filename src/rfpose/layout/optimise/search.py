@@ -1,4 +1,4 @@
-"""Where to put transmitters: local searches from many starts under a site's constraints, and the price of accuracy."""
+"""Local searches from many starts under a site's constraints, and the price of accuracy."""
 
 from __future__ import annotations
 
@@ -11,27 +11,16 @@ import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
-from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.layout import _kernels
-from rfpose.layout.maps import Mirrors, _chunks, _field, _plane_slope, check_site
-from rfpose.scenario import Scenario, Transmitter
+from rfpose.layout.maps import Mirrors, _chunks, _field, _plane_slope
+from rfpose.layout.optimise import _kernels
+from rfpose.layout.optimise.rules import Constraints, Costs
 
-__all__ = [
-    "CRITERIA",
-    "Constraints",
-    "Costs",
-    "Placement",
-    "Zone",
-    "evaluate_placement",
-    "optimise",
-    "pareto",
-    "scenario_with",
-]
+__all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "evaluate_placement", "optimise", "pareto"]
 
 Criterion = Literal["pdop", "independent", "rigid", "shared-clock"]
 CRITERIA: dict[str, int] = {
@@ -52,121 +41,6 @@ _BAND = 0.02
 _FEASIBLE = 1e-6
 _FEW_POINTS = 5000
 """Field points below which a search keeps to one core."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Zone:
-    """A piece of ground, from above: a polygon, or a circle.
-
-    Attributes
-    ----------
-    corner_enu_m : (corner, xy) or None
-        Polygon, any direction, not closed [m].
-    centre_enu_m, radius_m
-        Circle [m].
-    """
-
-    corner_enu_m: FloatArray | None = None
-    centre_enu_m: tuple[float, float] = (0.0, 0.0)
-    radius_m: float = np.nan
-
-    def __post_init__(self) -> None:
-        if self.corner_enu_m is None:
-            as_positive("radius_m", self.radius_m)
-        elif len(as_float_array("corner_enu_m", self.corner_enu_m, ("corner", 2))) < 3:
-            raise InvalidInputError("`corner_enu_m` must hold three or more corners")
-
-    def depth(self, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how deep each point (point, xy) lies inside [m] (negative: outside), and its slope (point, xy)."""
-        if self.corner_enu_m is None:
-            offset = point - np.asarray(self.centre_enu_m)
-            distance = np.linalg.norm(offset, axis=1)
-            return self.radius_m - distance, -offset / np.maximum(distance, 1e-12)[:, None]
-        start = np.asarray(self.corner_enu_m, np.float64)
-        edge = np.roll(start, -1, axis=0) - start
-        offset = point[:, None] - start
-        along = np.einsum("pcx,cx->pc", offset, edge) / np.maximum((edge**2).sum(axis=1), 1e-300)
-        gap = offset - np.clip(along, 0.0, 1.0)[..., None] * edge
-        nearest = np.argmin((gap**2).sum(axis=2), axis=1)
-        gap = gap[np.arange(len(point)), nearest]
-        distance = np.linalg.norm(gap, axis=1)
-        end = np.roll(start, -1, axis=0)
-        crosses = (start[:, 1] > point[:, 1:]) != (end[:, 1] > point[:, 1:])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x = start[:, 0] + (point[:, 1:] - start[:, 1]) / edge[:, 1] * edge[:, 0]
-        inside = np.where((crosses & (point[:, :1] < x)).sum(axis=1) % 2 == 1, 1.0, -1.0)
-        return inside * distance, inside[:, None] * gap / np.maximum(distance, 1e-12)[:, None]
-
-    @property
-    def box(self) -> tuple[FloatArray, FloatArray]:
-        """Smallest and largest (xy) coordinates [m]."""
-        if self.corner_enu_m is None:
-            centre = np.asarray(self.centre_enu_m)
-            return centre - self.radius_m, centre + self.radius_m
-        corner = np.asarray(self.corner_enu_m, np.float64)
-        return corner.min(axis=0), corner.max(axis=0)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Constraints:
-    """Where transmitters may stand.
-
-    Attributes
-    ----------
-    allowed
-        Each tower stands in one of these zones.
-    height_m
-        Lowest and highest antenna, z in the site frame [m].
-    excluded
-        No tower stands in any of these.
-    separation_m
-        Least horizontal distance between two towers [m].
-    clearance_m
-        Least horizontal distance to a heliostat [m].
-    """
-
-    allowed: tuple[Zone, ...]
-    height_m: tuple[float, float]
-    excluded: tuple[Zone, ...] = ()
-    separation_m: float = 0.0
-    clearance_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        low, high = self.height_m
-        if not (np.isfinite(low) and np.isfinite(high) and low <= high):
-            raise InvalidInputError(f"`height_m` must be (lowest, highest), got {self.height_m}")
-        if not self.allowed:
-            raise InvalidInputError("`allowed` must hold a zone")
-        if self.separation_m < 0.0 or self.clearance_m < 0.0:
-            raise InvalidInputError("`separation_m` and `clearance_m` must not be negative")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Costs:
-    """What new towers cost, in any currency: each, by height above ``ground_m``, by cable.
-
-    Cables run as the shortest tree over all towers and ``cable_start_enu_m``.
-    """
-
-    per_tower: float = 1.0
-    per_height_m: float = 0.0
-    per_cable_m: float = 0.0
-    cable_start_enu_m: tuple[float, float] = (0.0, 0.0)
-    ground_m: float = 0.0
-
-    def of(self, transmitter_enu_m: FloatArray, n_existing: int = 0) -> float:
-        """Return the cost of a site, whose first ``n_existing`` towers stand already (their cables, too)."""
-        new = transmitter_enu_m[n_existing:]
-        height = np.maximum(new[:, 2] - self.ground_m, 0.0).sum()
-        cable = 0.0
-        if self.per_cable_m > 0.0:
-            node = np.vstack([self.cable_start_enu_m, transmitter_enu_m[:, :2]])
-            # the tree takes what is below 1e-8 as not joined
-            length = np.maximum(np.linalg.norm(node[:, None] - node, axis=2), 1e-6)
-            standing = n_existing + 1
-            length[:standing, :standing] = 1e-6
-            cable = float(minimum_spanning_tree(length).sum())
-        return float(self.per_tower * len(new) + self.per_height_m * height + self.per_cable_m * cable)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -569,41 +443,3 @@ def pareto(
         for i, own in enumerate(merit)
     ]
     return [(p, not b) for p, b in zip(found, beaten, strict=True)]
-
-
-def scenario_with(scenario: Scenario, transmitter_enu_m: npt.ArrayLike, *, n_existing: int = 0) -> Scenario:
-    """Return the scenario with its transmitters at other places; as TOML by ``to_toml``.
-
-    The first ``n_existing`` keep their names. Carriers are the scenario's own while they last; more transmitters
-    share the band evenly anew.
-
-    Raises
-    ------
-    ScenarioError, pydantic.ValidationError
-        The band cannot hold so many carriers.
-    """
-    place = check_site(transmitter_enu_m)
-    names = [*scenario.transmitter_ids[:n_existing]]
-    names += [f"T{k + 1}" for k in range(len(place)) if f"T{k + 1}" not in names][: len(place) - n_existing]
-    radio = scenario.radio
-    if len(place) <= len(scenario.transmitter):
-        carrier = scenario.carrier_hz[: len(place)]
-    else:
-        half = 0.5 * radio.sample_rate_hz
-        margin = radio.clock_search_ppm * 1e-6 * (radio.centre_frequency_hz + half)
-        usable = half - margin - float(scenario.tone_hz.max())
-        carrier = np.linspace(-1.0, 1.0, len(place)) * usable * len(place) / (len(place) + 1.0)
-    amplitude = [t.amplitude for t in scenario.transmitter]
-    amplitude += [1.0] * len(place)
-    new = tuple(
-        Transmitter(id=name, position_enu_m=tuple(map(float, p)), carrier_hz=float(f), amplitude=a)
-        for name, p, f, a in zip(names, place, carrier, amplitude, strict=False)
-    )
-    # not model_copy: it would neither check the new transmitters nor drop the arrays made of the old ones
-    data = scenario.model_dump(exclude_none=True)
-    data["transmitter"] = [t.model_dump() for t in new]
-    kept = {t.id for t in new}
-    blocked = data.get("simulation", {}).get("blocked", ())
-    if blocked:
-        data["simulation"]["blocked"] = [b for b in blocked if b["transmitter"] in kept]
-    return Scenario.model_validate(data)

@@ -1,0 +1,130 @@
+"""Tones for a scenario: which reach a wanted accuracy of the mirror normals, safely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfpose.dsp.bounds import phase_bound_rad
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.layout import maps
+from rfpose.layout.maps import ESTIMATORS, Noise
+from rfpose.multilat.tones import Share, ToneDesign, design_tones
+from rfpose.scenario import load_scenario
+
+__all__ = ["SiteTones", "design_site_tones"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteTones:
+    """Tones for a site, and what the normals are then known to.
+
+    Attributes
+    ----------
+    scenario, estimator
+        Names.
+    tones
+        The set.
+    normal_mrad
+        Rms over the field of the bound of the mirror normal.
+    per_tone_index
+        Modulation index of each tone.
+    """
+
+    scenario: str
+    estimator: str
+    tones: ToneDesign
+    normal_mrad: float
+    per_tone_index: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the set with stable keys; angles in mrad of the normal."""
+        return {
+            "scenario": self.scenario,
+            "estimator": self.estimator,
+            "tone_hz": self.tones.frequency_hz,
+            "wavelength_m": self.tones.wavelength_m,
+            "modulation_index": self.per_tone_index,
+            "phase_sigma_rad": self.tones.phase_sigma_rad,
+            "range_sigma_m": self.tones.range_sigma_m,
+            "normal_mrad": self.normal_mrad,
+            "step_risk": self.tones.step_risk,
+            "wrong_risk": self.tones.wrong_risk,
+        }
+
+
+def design_site_tones(
+    scenario_path: str | Path,
+    *,
+    accuracy_mrad: float,
+    success: float = 1.0 - 1e-6,
+    band_hz: tuple[float, float] | None = None,
+    n_tone: int | None = None,
+    estimator: str = "rigid",
+    tone_snr_db: float | None = None,
+    share: Share = "index",
+) -> SiteTones:
+    """Choose a site's tones for a wanted accuracy of its mirrors' normals.
+
+    Noise of one phase is the Cramér–Rao bound of a single tone of the scenario's first tone's SNR; the field's geometry
+    turns range noise into that of the normal.
+
+    Parameters
+    ----------
+    scenario_path
+        TOML; its own tones matter for nothing but the first one's modulation index.
+    accuracy_mrad
+        Wanted rms of the normal's bound over the field [mrad].
+    success
+        Wanted probability that all whole wavelengths of a mirror are right.
+    band_hz
+        Lowest and highest tone [Hz]; by default up to half the least distance of two carriers, so that sidebands keep
+        apart, or unlimited with one carrier.
+    n_tone, share
+        See `rfpose.multilat.tones.design_tones`.
+    estimator
+        ``independent``, ``rigid`` or ``shared-clock``.
+    tone_snr_db
+        Overrides ``[simulation] tone_snr_db``.
+
+    Raises
+    ------
+    ScenarioError
+        The scenario is bad, or no tones do; the message begins with the file.
+    """
+    scenario = load_scenario(scenario_path)
+    try:
+        transmitter = maps.check_site(scenario.transmitter_enu_m)
+        mirrors = maps.mirrors_of(scenario)
+        unit = maps.normal_map(transmitter, mirrors, Noise.uniform(len(transmitter)), ESTIMATORS[estimator])
+        if not np.any(np.isfinite(unit)):
+            raise GeometryError("no mirror's normal is determined; add transmitters or receivers")
+        rad_per_m = float(np.sqrt(np.nanmean(unit**2)))
+        apart = np.linalg.norm(transmitter[:, None] - transmitter, axis=2)
+        carriers = np.sort(scenario.carrier_hz)
+        spacing = float(np.min(np.diff(carriers))) if len(carriers) > 1 else 2.0 * np.inf
+        snr_db = scenario.simulation.tone_snr_db if tone_snr_db is None else tone_snr_db
+        tones = design_tones(
+            reach_m=float(apart.max(axis=1).min()),
+            phase_sigma_rad=float(phase_bound_rad(scenario.radio.frame_samples, 10.0 ** (snr_db / 10.0))),
+            range_sigma_m=1e-3 * accuracy_mrad / rad_per_m,
+            success=success,
+            band_hz=(0.0, spacing / 2.0) if band_hz is None else band_hz,
+            n_tone=n_tone,
+            n_difference=mirrors.receiver_mirror_m.shape[1] * (len(transmitter) - 1),
+            share=share,
+            speed_mps=scenario.radio.propagation_speed_mps,
+        )
+    except (GeometryError, InvalidInputError) as error:
+        raise ScenarioError(f"{scenario_path}: {error}") from error
+    index = scenario.tone[0].modulation_index
+    return SiteTones(
+        scenario=scenario.name,
+        estimator=estimator,
+        tones=tones,
+        normal_mrad=1e3 * rad_per_m * tones.range_sigma_m,
+        per_tone_index=index / len(tones.frequency_hz) if share == "index" else index,
+    )
