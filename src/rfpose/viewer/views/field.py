@@ -338,11 +338,13 @@ class FieldView(View):
             f"Below: {what}, 95 % ellipse."
         )
         for k, curve in enumerate(self.offset_curves):
-            curve.setData(found.time_s, 1e-3 * found.offset_mrad[:, k])
+            measured = np.isfinite(found.offset_mrad[:, k])
+            curve.setData(found.time_s[measured], 1e-3 * found.offset_mrad[measured, k])
         known = np.isfinite(found.sigma_mrad)
         for sign, line in zip((1.0, -1.0), self.band, strict=True):
             line.setData(found.time_s[known], 1e-3 * sign * found.sigma_mrad[known])
-        outline = 1e-3 * np.concatenate([found.ellipse_mrad, np.full((len(found.ellipse_mrad), 1, 2), np.nan)], axis=1)
+        outlined = np.isfinite(found.ellipse_mrad).all(axis=(1, 2))
+        outline = 1e-3 * np.pad(found.ellipse_mrad[outlined], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         self.ellipses.setData(outline[..., 0].ravel(), outline[..., 1].ravel())
         seen = np.isfinite(found.offset_mrad).all(axis=1)
         self.ellipse_dots.setData(1e-3 * found.offset_mrad[seen, 0], 1e-3 * found.offset_mrad[seen, 1])

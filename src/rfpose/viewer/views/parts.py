@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, QRectF, Qt
-from PySide6.QtGui import QColor, QPainter, QPen
+from PySide6.QtGui import QColor, QPainter, QPen, QTransform
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QHeaderView,
@@ -104,7 +104,9 @@ class Dots(pg.GraphicsObject):  # type: ignore[misc]
         seen = np.isfinite(x) & np.isfinite(y)
         self._x, self._y, self._size = np.asarray(x), np.asarray(y), size_px
         self._groups = []
-        self._all = pg.functions.arrayToQPolygonF(self._x[seen], self._y[seen]) if self._rim is not None else None
+        self._all = None
+        if self._rim is not None and seen.any():
+            self._all = pg.functions.arrayToQPolygonF(self._x[seen], self._y[seen])
         for k in np.unique(colour[seen]) if seen.any() else ():
             mine = seen & (colour == k)
             self._groups.append((table[int(k)], pg.functions.arrayToQPolygonF(self._x[mine], self._y[mine])))
@@ -118,15 +120,18 @@ class Dots(pg.GraphicsObject):  # type: ignore[misc]
     def paint(self, painter: QPainter, *_: Any) -> None:
         """Draw, a colour at a time."""
         painter.setRenderHint(QPainter.RenderHint.Antialiasing, len(self._x) < _MANY)
+        # Qt draws a round point as a line of a fixed length in the units at hand: in pixels it cannot be seen
+        transform = painter.worldTransform()
+        painter.setWorldTransform(QTransform())
         groups = self._groups
         if self._all is not None and self._rim is not None and len(self._x) < _MANY:
             groups = [(self._rim, self._all), *groups]
         for colour, polygon in groups:
             pen = QPen(colour, self._size + (2.0 if colour is self._rim else 0.0))
-            pen.setCosmetic(True)
             pen.setCapStyle(Qt.PenCapStyle.RoundCap if len(self._x) < _MANY else Qt.PenCapStyle.SquareCap)
             painter.setPen(pen)
-            painter.drawPoints(polygon)
+            painter.drawPoints(transform.map(polygon))
+        painter.setWorldTransform(transform)
 
     def boundingRect(self) -> QRectF:  # noqa: N802 -- Qt's name
         """Where there is something to draw."""

@@ -90,11 +90,9 @@ class TrackingView(View):
         self.spot_plot.addItem(pg.InfiniteLine(angle=90, pen=pg.mkPen(theme.muted, width=1)), ignoreBounds=True)
         self.spots = Dots(rim=theme.muted)
         self.spot_plot.addItem(self.spots)
-        self.curve_plot = plot_in(
-            self.graphs, theme, x="time, nights left out [h]", y="rms error of the normal [mrad]", row=1
-        )
+        self.curve_plot = plot_in(self.graphs, theme, x="time, nights left out [h]", y="rms error [mrad]", row=1)
         self.curve_plot.setLogMode(y=True)
-        self.legend = self.curve_plot.addLegend(offset=(-4, 4), labelTextSize="7pt", colCount=3)
+        self.legend = self.curve_plot.addLegend(offset=(-4, 2), labelTextSize="7pt", colCount=5)
         self.cursor_line = pg.InfiniteLine(angle=90, movable=True, pen=pg.mkPen("#E69F00", width=2))
         self.cursor_line.sigDragged.connect(lambda line: self._cursor_dragged(line))
         self.curve_plot.addItem(self.cursor_line, ignoreBounds=True)
@@ -132,8 +130,11 @@ class TrackingView(View):
             style = Qt.PenStyle.SolidLine if k < len(SERIES) else Qt.PenStyle.DashLine
             pen = pg.mkPen(SERIES[k % len(SERIES)], width=1.5, style=style)
             values = picture.rms_mrad[name]
+            if not (values > 0.0).any():
+                continue  # a path of nothing but NaN takes Qt down
             positive = np.where(values > 0.0, values, np.nan)
             self._curves[name] = self.curve_plot.plot(picture.hours, positive, pen=pen, name=name, connect="finite")
+        self._scale_errors(picture)
         if len(picture.pivot_enu_m):
             ground = np.concatenate([picture.pivot_enu_m, picture.target_enu_m])[:, :2]
             ground = ground[np.isfinite(ground).all(axis=1)]
@@ -144,6 +145,19 @@ class TrackingView(View):
         self.position.setRange(0, max(picture.n_instant - 1, 0))
         self.position.blockSignals(False)
         self._draw()
+
+    def _scale_errors(self, picture: TrackPicture) -> None:
+        """Put room for the key above the curves, and few enough numbers beside them."""
+        values = np.concatenate([np.empty(0), *picture.rms_mrad.values()])
+        values = values[np.isfinite(values) & (values > 0.0)]
+        if not values.size:
+            return
+        low, high = np.log10(np.percentile(values, 0.5)), np.log10(values.max())
+        span = max(high - low, 0.3)
+        self.curve_plot.setYRange(low - 0.05 * span, high + 0.45 * span, padding=0.0)
+        decades = range(int(np.floor(low)) - 1, int(np.ceil(high)) + 1)
+        marks = [(np.log10(k) + d, f"{k * 10.0**d:g}") for d in decades for k in (1, 2, 5)]
+        self.curve_plot.getAxis("left").setTicks([marks])
 
     def _set_speed(self) -> None:
         self.session.playback.frames_per_s = float(self.speed.currentData())
