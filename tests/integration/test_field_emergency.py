@@ -89,6 +89,9 @@ def test_flux_comes_back_on_approach_and_goes_with_the_wind():
     assert got.n_mode[240, Mode.TRACK] == 64
     assert got.flux[times > 265.0].max() < 1e-3
     assert got.n_mode[-1, Mode.STOW] == 64
+    # the last times count, not those of the beginning in stow
+    assert np.all(got.off_receiver_s >= 250.0)
+    assert np.all(got.stowed_s >= 250.0)
 
 
 def test_mirrors_without_power_stay_and_the_sun_takes_the_flux_away():

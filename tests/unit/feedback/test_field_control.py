@@ -74,6 +74,15 @@ def test_leaves_stow_azimuth_first_and_returns_elevation_first():
     assert n_moved > 100
 
 
+def test_axes_move_no_faster_than_their_rate_and_no_further_than_their_target():
+    axis = np.array([[0.0, 1.0], [0.0, 1.0], [np.nan, 0.5]])
+    target = np.array([[1.0, 0.9], [-0.05, np.nan], [0.3, 0.5]])
+    moved = move_axes(axis, target, 2.0, rate_rad_s=0.1)
+    np.testing.assert_allclose(moved, [[0.2, 0.9], [-0.05, 1.0], [np.nan, 0.5]])
+    # 270 degrees in two minutes, the default
+    np.testing.assert_allclose(move_axes([[0.0, 0.0]], [[9.0, -9.0]], 120.0), np.radians([[270.0, -270.0]]))
+
+
 def test_stow_face_up_is_reached_upwards():
     rig = Rig(mode=Mode.TRACK, settings=FieldSettings(stow_axis_rad=(0.0, np.pi / 2)))
     rig.run(5)
