@@ -68,7 +68,7 @@ def test_wrong_no_more_often_than_stated():
     posterior = found.odds_against / (1.0 + found.odds_against)
     assert posterior.sum() == pytest.approx(wrong.sum(), rel=0.15)
     rounded = np.any(np.rint(value) != z, axis=1)
-    assert wrong.sum() < 0.2 * rounded.sum()
+    assert wrong.sum() < 0.4 * rounded.sum()
 
 
 def test_rows_that_cannot_be_solved_say_so():
