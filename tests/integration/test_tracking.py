@@ -129,7 +129,7 @@ def test_an_unreachable_aim_point_is_told():
     low = scenario(drive={"elevation_limits_deg": (-5.0, 50.0)})
     part = score(run(low, ("open-loop",)).sums("open-loop")).out_of_reach
     assert 0.1 < part < 1.0
-    with pytest.raises(ScenarioError, match="no mirror reaches its aim point.*beyond its limits"):
+    with pytest.raises(ScenarioError, match=r"no mirror reaches its aim point.*beyond its limits"):
         Simulation(scenario(drive={"elevation_limits_deg": (-5.0, 0.0)}), methods=("open-loop",))
 
 

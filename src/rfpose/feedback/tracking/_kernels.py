@@ -13,14 +13,15 @@ import numba as nb
 import numpy as np
 
 from rfpose.feedback._kernels import _axis, _bisector, _command_one, _posture, _prepare
+from rfpose.feedback.servo._kernels import law_step, stepper_step
 from rfpose.jit import kernel, kernel_parallel
 
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
 # state of a mirror under one method
 MOTOR, AXIS, COMMAND, NEXT, SLIP, MOVED, INNOVATION, SHIFT, RAMP = 0, 2, 4, 6, 8, 10, 12, 14, 17
-LEARNED, SILENT, STARTED, UNREACHABLE = 20, 21, 22, 23
-N_STATE = 24
+GOAL, LEARNED, SILENT, STARTED, UNREACHABLE = 20, 22, 23, 24, 25
+N_STATE = 26
 
 # a measurement on its way
 N_RING, N_ENTRY = 16, 6
@@ -46,11 +47,6 @@ class Loop(NamedTuple):
     feedback: int
     interval: int
     latency: int
-    gain: float
-    integral: float
-    step: float
-    dead_band: float
-    speed: float
     leak: float
     """Part of the shift kept from one silent frame to the next, once silence lasts."""
     learn: int
@@ -191,8 +187,9 @@ def _shifted(p, k, prepared, shift, counts, guess, row, work):
 
 @kernel
 def _track(
-    loop, step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
-    bias, lost, outage, power, backlash, stiction, drift, sensor, state, ring, total, hours, hour_of, histogram,
+    loop, law, drive_1, drive_2,
+    step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
+    bias, lost, outage, power, drift, sensor, state, ring, total, hours, hour_of, histogram,
     stride, trace_error, trace, keeps,
 ):  # fmt: skip
     """One mirror through a stretch of steps; see `advance`."""
@@ -250,9 +247,9 @@ def _track(
                     state[COMMAND + a] = state[NEXT + a]
             if first:
                 for a in range(2):
-                    at = math.floor(state[COMMAND + a] / loop.step + 0.5) * loop.step
-                    state[MOTOR + a] = at
-                    state[AXIS + a] = at
+                    step = drive_1.step
+                    at = math.floor(state[COMMAND + a] / step + 0.5) * step
+                    state[MOTOR + a] = state[AXIS + a] = state[GOAL + a] = at
                 state[STARTED] = 1.0
         # a measurement has arrived
         due = g - loop.latency
@@ -263,15 +260,15 @@ def _track(
                 state[SILENT] = 0.0
                 busy = False
                 for a in range(2):
-                    busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > loop.speed
+                    busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > drive_1.speed
                 if loop.feedback == ENCODER:
                     for a in range(2):
-                        state[SLIP + a] += seconds * loop.gain * entry[1 + a]
+                        state[SLIP + a] += seconds * law.gain * entry[1 + a]
                 elif not busy:  # a motor that runs flat out is on its way: nothing winds up meanwhile
                     for i in range(3):
-                        state[RAMP + i] += loop.integral * seconds * entry[1 + i]
+                        speed, state[RAMP + i] = law_step(entry[1 + i], state[RAMP + i], law, seconds)
                         change[i] = state[SHIFT + i]
-                        moved = change[i] + seconds * (loop.gain * entry[1 + i] + state[RAMP + i])
+                        moved = change[i] + seconds * speed
                         state[SHIFT + i] = min(max(moved, -_LIMIT_RAD), _LIMIT_RAD)
                         change[i] = state[SHIFT + i] - change[i]
                     # at once, to first order; exact from the next command on
@@ -319,18 +316,15 @@ def _track(
         for a in range(2):
             want = state[COMMAND + a] + (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[13 + a]
             want = min(max(want, k[22 + 2 * a]), k[23 + 2 * a])
-            move = 0.0
-            if abs(want - state[MOTOR + a]) > loop.dead_band:
-                goal = math.floor(want / loop.step + 0.5) * loop.step
-                move = min(max(goal - state[MOTOR + a], -loop.speed), loop.speed)
-                state[MOTOR + a] += move
+            before = state[MOTOR + a]
+            state[MOTOR + a], state[AXIS + a], state[GOAL + a] = stepper_step(
+                want, before, state[AXIS + a], state[GOAL + a], drive_1 if a == 0 else drive_2, 1.0
+            )
+            move = state[MOTOR + a] - before
             total[MOTOR_1 + a] += abs(move)
             if move != 0.0 and state[MOVED + a] == 0.0:
                 total[STARTS] += 1.0
             state[MOVED + a] = move
-            gap = state[MOTOR + a] - state[AXIS + a]
-            if abs(gap) > 0.5 * backlash[a] + stiction[a]:
-                state[AXIS + a] = state[MOTOR + a] - math.copysign(0.5 * backlash[a], gap)
         # where the mirror really points
         axis_1 = _axis(0, state[AXIS], p, k, prepared)
         axis_2 = _axis(1, state[AXIS + 1], p, k, prepared)
@@ -454,13 +448,15 @@ def _track(
 
 @kernel_parallel
 def advance(
-    loop, step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
-    bias, lost, outage, power, backlash, stiction, drift, sensor, state, ring, total, hours, hour_of, histogram,
+    loop, law, drive_1, drive_2,
+    step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
+    bias, lost, outage, power, drift, sensor, state, ring, total, hours, hour_of, histogram,
     stride, trace_error, stored, trace,
 ):  # fmt: skip
     """Take all mirrors through a stretch of steps, in place of ``model, cov, state, ring`` and the sums.
 
-    First axis is the mirror. ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model``
+    ``law`` turns errors into speeds; ``drive_1, drive_2`` are in counts, a servo step being one unit of time. First
+    axis is the mirror. ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model``
     what the controller believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz);
     ``target`` (xyz, 1 for a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``noise`` (frame, 2) of variance
     one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step);
@@ -470,8 +466,9 @@ def advance(
     for h in nb.prange(p.shape[0]):
         keeps = stored[h] >= 0
         _track(
-            loop, step0, p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
-            mean_speed, bend, noise[h], spread[h], bias[h], lost[h], outage[h], power, backlash, stiction, drift[h],
+            loop, law, drive_1, drive_2,
+            step0, p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
+            mean_speed, bend, noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
             sensor[h], state[h], ring[h], total[h], hours[h], hour_of, histogram[h], stride, trace_error[h],
             trace[max(stored[h], 0)], keeps,
         )  # fmt: skip

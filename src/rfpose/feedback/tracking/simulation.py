@@ -12,6 +12,8 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.feedback.mount import PARAMETERS
+from rfpose.feedback.servo import PiLaw, Stepper
+from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.hidden import Field, draw_field, generator
 from rfpose.feedback.tracking.instruments import LEARNED, Workshop
@@ -87,6 +89,7 @@ class _Run:
 
     method: Method
     loop: _kernels.Loop
+    law: LawNumbers
     model: FloatArray
     cov: FloatArray
     state: FloatArray
@@ -224,13 +227,11 @@ class Simulation:
                 "[tracking.drive] limits"
             )
 
-    def _loop(self, method: Method) -> _kernels.Loop:
+    def _loop(self, method: Method) -> tuple[_kernels.Loop, LawNumbers]:
         plan = self.scenario.tracking
         radio, servo = plan.radio, plan.servo_interval_s
         control = round(plan.control_interval_s / servo)
-        per_rad = plan.drive.steps_per_turn / (2.0 * np.pi)
-        step = float(plan.drive.microsteps)
-        interval, latency, gain, integral, level = control, 1, 0.0, 0.0, 1.0  # what is seen in a step acts in the next
+        interval, latency, gain, integral, level = control, 1, 1.0, 0.0, 1.0  # what is seen in a step acts in the next
         if method.feedback == _kernels.RADIO:
             gain, integral = radio.gain_per_s, radio.integral_gain_per_s2
             latency = max(int(np.ceil(radio.latency_s / servo - 1e-9)), 1)
@@ -247,15 +248,16 @@ class Simulation:
             level = 2e-3 * sensor.range_mrad / sensor.levels
         seconds = interval * servo
         learn = max(1, round(plan.radio_model.learn_interval_s / plan.control_interval_s)) if method.learns else 0
-        return _kernels.Loop(
+        law = PiLaw(
+            gain_per_s=gain,
+            integral_gain_per_s2=integral,
+            speed_radps=1e-3 * plan.drive.speed_mradps,
+            levels=0,
+        ).numbers()
+        loop = _kernels.Loop(
             feedback=method.feedback,
             interval=interval,
             latency=latency,
-            gain=gain,
-            integral=integral,
-            step=step,
-            dead_band=max(plan.drive.dead_band_steps * 1.0, 0.5 * step),
-            speed=max(np.floor(1e-3 * plan.drive.speed_mradps * servo * per_rad / step), 1.0) * step,
             leak=float(np.exp(-seconds / _FORGET_OFFSET_S)) if method.learns else 1.0,
             learn=learn,
             wind_variance=self.gusts.variance_rad2,
@@ -265,16 +267,41 @@ class Simulation:
             reach=1e-3 * plan.sun_sensor.range_mrad,
             disc=0.5 * _SUN_RAD + 1e-3 * plan.slope_error_mrad,
         )
+        return loop, law
+
+    def _drive(self, axis: int) -> DriveNumbers:
+        """Return one axis's motor and gear in counts and servo steps."""
+        drive, servo = self.scenario.tracking.drive, self.scenario.tracking.servo_interval_s
+        count = 2.0 * np.pi / drive.steps_per_turn
+        wait = drive.dead_band_steps * count if drive.dead_band_steps > 0.0 else None
+        numbers = Stepper(
+            steps_per_turn=drive.steps_per_turn,
+            microsteps=drive.microsteps,
+            speed_radps=1e-3 * drive.speed_mradps,
+            backlash_rad=1e-3 * drive.backlash_mrad[axis],
+            stiction_rad=1e-3 * drive.stiction_mrad[axis],
+            dead_band_rad=wait,
+        ).numbers(servo)
+        return DriveNumbers(
+            step=numbers.step / count,
+            speed=numbers.speed * servo / count,
+            half_backlash=numbers.half_backlash / count,
+            stiction=numbers.stiction / count,
+            dead_band=numbers.dead_band / count,
+            lead=numbers.lead / count,
+        )
 
     def _start(self, method: Method) -> _Run:
         n, n_time = len(self.field), len(self.stored_unix_s)
         n_free = len(_FREE)
+        loop, law = self._loop(method)
         cov = np.zeros((n, n_free, n_free)) if method.learns else np.zeros((1, n_free, n_free))
         if method.learns:
             cov[:, np.arange(n_free), np.arange(n_free)] = _FIRST_SIGMA_RAD**2
         return _Run(
             method=method,
-            loop=self._loop(method),
+            loop=loop,
+            law=law,
             model=self.field.nominal.copy(),
             cov=cov,
             state=np.zeros((n, _kernels.N_STATE)),
@@ -324,12 +351,12 @@ class Simulation:
             is_sensor = run.method.feedback == _kernels.SUN_SENSOR
             drift = self._sensor_drift() if is_sensor else self.field.plate_drift_rad
             _kernels.advance(
-                loop, segment.first, true, self.field.constant, self.field.lean_rad, day.heat[steps].copy(), run.model,
+                loop, run.law, self._drive(0), self._drive(1),
+                segment.first, true, self.field.constant, self.field.lean_rad, day.heat[steps].copy(), run.model,
                 np.broadcast_to(run.cov, (n, *run.cov.shape[1:])).copy() if not run.method.learns else run.cov,
                 _FREE, _SCALE, self._walk(), day.sun_enu[segment.first : segment.end + loop.interval + 1].copy(),
                 self.field.target, gust, self.gusts.mean_mps, self.gusts.bend, noise, spread, bias, lost, outage,
-                day.power_w_per_m2[steps].copy(), 1e-3 * np.array(plan.drive.backlash_mrad) * self._per_rad(),
-                1e-3 * np.array(plan.drive.stiction_mrad) * self._per_rad(), drift, self.field.sensor_bias_rad,
+                day.power_w_per_m2[steps].copy(), drift, self.field.sensor_bias_rad,
                 run.state, run.ring, run.total[segment.i_day], run.hours, day.hour[steps].astype(np.int64),
                 run.histogram, self._stride, error, stored, trace,
             )  # fmt: skip
@@ -349,9 +376,6 @@ class Simulation:
             run.cov[:, np.arange(len(_FREE)), np.arange(len(_FREE))] += sigma**2 * passed
             return
         run.model[:] = self._workshop.model(run.method, day)
-
-    def _per_rad(self) -> float:
-        return self.scenario.tracking.drive.steps_per_turn / (2.0 * np.pi)
 
     def _walk(self) -> FloatArray:
         """Variance that the rolling fit adds to each parameter at a step."""
