@@ -27,10 +27,10 @@ __all__ = [
     "Spectrum",
     "Waterfall",
     "line_health",
+    "losses",
     "look_at_frame",
     "phase_track",
     "phases_of",
-    "recorded_spans",
     "spectrum",
     "viewing_frames",
     "waterfall",
@@ -234,12 +234,17 @@ def viewing_frames(recording: Recording, scenario: Scenario | None) -> tuple[npt
     return runs[:1, 0].copy(), int(runs[0, 1])
 
 
-def recorded_spans(recording: Recording, receiver_id: str) -> FloatArray:
-    """Return when a receiver recorded (block, 2): begin and end from the recording's first sample [s]."""
-    blocks = recording.blocks(receiver_id)
-    first = _first_index(recording)
-    begin = (blocks[:, 0] - first).astype(np.float64)
-    return np.stack([begin, begin + blocks[:, 1]], axis=1) / float(recording.sample_rate)
+def losses(recording: Recording, receiver_id: str) -> tuple[int, int]:
+    """Return how many stretches, and samples, a receiver missed while any other recorded."""
+    runs, blocks = recorded_runs(recording), recording.blocks(receiver_id)
+    missed = 0
+    for start, count in runs:
+        first, last = np.searchsorted(blocks[:, 0], [start, start + count])
+        inside = blocks[first:last]
+        end = np.concatenate([[start], inside.sum(axis=1)])
+        begin = np.concatenate([inside[:, 0], [start + count]])
+        missed += int(np.count_nonzero(begin > end))
+    return missed, int(runs[:, 1].sum() - blocks[:, 1].sum())
 
 
 def _first_index(recording: Recording) -> int:

@@ -150,8 +150,8 @@ class Workers(QObject):
                 job.cancel()
         self.changed.emit()
 
-    def stop(self, timeout_s: float = 5.0) -> bool:
-        """End all and wait for their threads; tells whether all have ended."""
+    def stop(self, timeout_s: float = 2.0) -> bool:
+        """End all and wait a little for their threads, which die with the program; tells whether all have ended."""
         self._closed = True
         self.cancel()
         waited = [job.wait(timeout_s) for job in tuple(self._jobs)]

@@ -26,10 +26,10 @@ from rfpose.pipeline.spectra import (
     Spectrum,
     Waterfall,
     line_health,
+    losses,
     look_at_frame,
     phase_track,
     phases_of,
-    recorded_spans,
     spectrum,
     waterfall,
 )
@@ -533,16 +533,16 @@ class RecordingView(View):
                 continue
             level, clipped = entry.get("rms_dbfs"), entry.get("clipped_fraction")
             try:
-                gaps = max(len(recorded_spans(document.recording, name)) - 1, 0)
+                gaps, lost = losses(document.recording, name)
             except RfposeError:
-                gaps = 0
+                gaps = lost = 0
             rows.append(
                 [
                     name,
                     "–" if level is None else f"{level:.1f}",
                     "–" if clipped is None else f"{100.0 * clipped:.3g} %",
                     str(gaps),
-                    str(entry.get("lost_samples", 0)),
+                    str(lost),
                     str(entry.get("blocks", 0)),
                 ]
             )

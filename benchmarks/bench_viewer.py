@@ -1,0 +1,148 @@
+"""Viewer: frames a second while a transmitter is dragged, time to the first picture of a large recording, memory.
+
+    python benchmarks/bench_viewer.py
+
+Draws without a screen, with the same widgets. The recording is sparse: 10 GB of samples that were never written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+os.environ["QT_QPA_PLATFORM"] = "offscreen"
+
+import h5py
+import numpy as np
+import psutil
+
+from rfpose.layout.fields import radial_staggered
+from rfpose.pipeline.demo import shipped_scenario
+from rfpose.recording import RecordingWriter
+from rfpose.scenario import Scenario, load_scenario
+from rfpose.viewer.export import open_window, settle
+
+
+class Peak:
+    """Largest resident memory while it lasts."""
+
+    def __enter__(self) -> Peak:
+        self.bytes, self._stop = 0, threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+        return self
+
+    def _watch(self) -> None:
+        process = psutil.Process()
+        while not self._stop.wait(0.01):
+            self.bytes = max(self.bytes, process.memory_info().rss)
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def large_recording(folder: Path, gigabytes: float) -> Path:
+    """One receiver of a heliostat with so many samples, none of which stands on the disk."""
+    site = load_scenario(shipped_scenario("table2_100m.toml"))
+    path = folder / "large.h5"
+    with RecordingWriter(
+        path,
+        scenario=site,
+        receiver_ids=site.receiver_ids,
+        sample_rate=site.radio.sample_rate,
+        centre_frequency_hz=site.radio.centre_frequency_hz,
+        sample_format="int16",
+        full_scale=32767.0,
+    ) as writer:
+        rng = np.random.default_rng(1)
+        for name in site.receiver_ids:
+            writer.write(name, 0, rng.integers(-2000, 2000, (site.radio.frame_samples, 2)).astype(np.int16))
+    count = int(gigabytes * 1e9 / 4)
+    name = site.receiver_ids[0]
+    with h5py.File(path, "r+") as file:
+        iq = file[f"receivers/{name}/iq"]
+        iq.resize((count,))
+        file[f"receivers/{name}/blocks"][0] = (0, count, 0)
+    return path
+
+
+def open_large(gigabytes: float) -> None:
+    """Open a large recording in a running viewer and wait for each picture."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = large_recording(folder, gigabytes)
+        size, on_disk = path.stat().st_size, 512 * path.stat().st_blocks
+        app, window = open_window(shipped_scenario("table2_100m.toml"))  # a viewer that is up and running
+        view = window.views["recording"]
+        with Peak() as peak:
+            start = time.perf_counter()
+            window.open_path(path)
+            seen: dict[str, float] = {}
+            while len(seen) < 4 or window.workers.jobs:
+                app.processEvents()
+                for what in ("spectrum", "waterfall", "track", "_summary"):
+                    if what not in seen and getattr(view, what, None) is not None:
+                        view.grab()
+                        seen[what] = time.perf_counter() - start
+            settle(app, window)
+        print(f"recording of {size / 1e9:.1f} GB ({on_disk / 1e6:.0f} MB on the disk)")
+        for what, text in (
+            ("spectrum", "first picture (spectrum with every carrier)"),
+            ("waterfall", "waterfall over all frames"),
+            ("track", "phases over 100 frames"),
+            ("_summary", "levels of all receivers"),
+        ):
+            print(f"  {text}: {seen[what]:.2f} s")
+        print(f"  peak memory of the whole viewer: {peak.bytes / 1e6:.0f} MB")
+        window.close()
+
+
+def drag(n_heliostat: int, n_step: int) -> None:
+    """Drag a transmitter around a circle, as fast as pictures come."""
+    site = load_scenario(shipped_scenario("table2_100m.toml"))
+    data = site.model_dump(exclude_none=True)
+    like = data["heliostat"][0]
+    places = radial_staggered(n_heliostat, first_radius_m=12.0, diagonal_m=3.0, height_m=2.0)
+    data["heliostat"] = [
+        like | {"id": f"H{k}", "pivot_enu_m": tuple(p), "receiver_ids": tuple(f"H{k}_r{i}" for i in range(3))}
+        for k, p in enumerate(places.tolist())
+    ]
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "field.toml"
+        path.write_text(Scenario.model_validate(data).to_toml())
+        app, window = open_window(path)
+    view, edit = window.views["layout"], window.session.layout
+    for estimator in ("rigid", "shared-clock", "independent", "carrier"):
+        edit.choose(estimator=estimator)
+        settle(app, window)
+        maps = worst = 0.0
+        edit.begin_drag()
+        start = last = time.perf_counter()
+        for k in range(n_step):
+            angle = 2.0 * np.pi * k / n_step
+            shown = view.map
+            edit.move("T1", east=100.0 * np.cos(angle), north=100.0 * np.sin(angle))
+            while view.map is shown:
+                app.processEvents()
+            view.graphs.viewport().repaint()
+            now = time.perf_counter()
+            worst, last, maps = max(worst, now - last), now, maps + 1
+        edit.end_drag()
+        rate = maps / (last - start)
+        print(f"drag, {n_heliostat} mirrors, {estimator}: {rate:.1f} pictures/s, longest {1e3 * worst:.0f} ms")
+    window.close()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--gigabytes", type=float, default=10.0)
+    parser.add_argument("--mirrors", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=100)
+    options = parser.parse_args()
+    open_large(options.gigabytes)
+    drag(options.mirrors, options.steps)
