@@ -1,0 +1,333 @@
+"""IQ to normal with reflections, bad transmitters and drifting delays: what the estimators mend, and what they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.multilat import PoseStatus
+from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
+from rfpose.pipeline.bound import normal_bound_rad
+from rfpose.pipeline.choice import PoseChoice, choose
+from rfpose.pipeline.evaluate import evaluate
+from rfpose.pipeline.noise import phase_noise
+from rfpose.pipeline.process import process
+from rfpose.pipeline.result_file import Result, read_result, summarise, write_result
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.solve import check_solvable
+from rfpose.scenario import Scenario, load_scenario
+
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
+COEFFICIENT = (-0.3, 0.1)
+N_FRAME = 12
+N_POSE = 4 * N_FRAME
+
+
+def site(
+    mirror: dict[str, Any], simulation: dict[str, Any], *, tone_hz: tuple[float, ...] = (0.75e6, 7.5e6)
+) -> Scenario:
+    """Four heliostats of the shipped field, carriers far enough apart for 7.5 MHz tones."""
+    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
+    data["heliostat"] = [{**h, **mirror} for h in data["heliostat"][:4]]
+    data["radio"] |= {"sample_rate_hz": 64e6, "frame_samples": 4000, "clock_search_ppm": 2.0}
+    data["tone"] = [{"frequency_hz": f, "modulation_index": 0.8 / len(tone_hz)} for f in tone_hz]
+    for i, transmitter in enumerate(data["transmitter"]):
+        transmitter["carrier_hz"] = -16.2e6 + 3.6e6 * i
+    data["simulation"] |= {
+        "frame_count": N_FRAME,
+        "frame_interval_s": 1.0,
+        "tone_snr_db": 60.0,
+        "sun_azimuth_deg": 170.0,
+        "path_loss": "free_space",
+        **simulation,
+    }
+    return Scenario.model_validate(data)
+
+
+def recorded(scenario: Scenario, directory: Path, name: str) -> Path:
+    (directory / f"{name}.toml").write_text(scenario.to_toml())
+    simulate_recording(directory / f"{name}.toml", directory / f"{name}.h5", seed=3)
+    return directory / f"{name}.h5"
+
+
+# -- reflections ---------------------------------------------------------------------------------------------
+
+KNOWN = {"pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 0.0}
+
+
+@pytest.fixture(scope="module")
+def two_ray(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    ground = {"ground": {"coefficient": COEFFICIENT}}
+    return recorded(site(KNOWN, ground), tmp_path_factory.mktemp("two_ray"), "two")
+
+
+@pytest.fixture(scope="module")
+def free_rms(tmp_path_factory: pytest.TempPathFactory) -> float:
+    path = recorded(site(KNOWN, {}), tmp_path_factory.mktemp("free"), "free")
+    found = evaluate(process(path, path.with_name("r.h5"), estimator="correlator"))
+    assert found.failed == 0
+    return found.normal_error_mrad.rms
+
+
+@pytest.fixture(scope="module")
+def estimated(two_ray: Path) -> Result:
+    return process(two_ray, two_ray.with_name("estimated.h5"), estimator="correlator", reflection="estimate")
+
+
+def test_an_estimated_reflection_costs_no_accuracy(estimated: Result, free_rms: float) -> None:
+    found = evaluate(estimated)
+    assert found.failed == 0
+    assert found.normal_error_mrad.rms <= 1.3 * free_rms
+    # the rms of that many pairs of angles is known to 1/√(4 n)
+    assert found.ratio_to_bound < 1.0 + 4.0 / np.sqrt(4.0 * N_POSE)
+    assert found.protection is not None
+    assert (found.protection.exceeded, found.protection.covered) == (0, N_POSE)
+
+
+def test_the_coefficient_and_its_sigma_are_in_the_result(estimated: Result, two_ray: Path) -> None:
+    table = estimated.reflection
+    assert table is not None
+    error = table.coefficient[..., 0] - complex(*COEFFICIENT)
+    assert np.all(np.abs(error.real) < 5.0 * table.coefficient_sigma[..., 0, 0])
+    assert np.all(np.abs(error.imag) < 5.0 * table.coefficient_sigma[..., 0, 1])
+    assert table.coefficient_sigma.max() < 1e-3
+    assert np.all(table.probability_direct < 1e-3)
+    again = read_result(two_ray.with_name("estimated.h5"))
+    assert again.settings["reflection"] == "estimate"
+    summary = summarise(again)["reflection"]
+    assert (summary["needed"], summary["coefficients"]["ground"]["status"]) == (N_POSE, "estimated")
+
+
+def test_an_ignored_reflection_is_never_silent(two_ray: Path) -> None:
+    result = process(two_ray, two_ray.with_name("ignored.h5"), estimator="correlator", reflection="ignore")
+    assert result.truth is not None
+    error = np.linalg.norm(result.poses.normal_enu - result.truth.normal_enu, axis=-1)
+    assert np.all(error > 1e-3)
+    assert np.all(result.poses.status == PoseStatus.UNEXPLAINED)
+    assert result.integrity is not None
+    assert np.all(np.isinf(result.integrity.protection_level_rad))
+    assert summarise(result)["integrity"]["excluded"] == {}
+
+
+def test_a_given_coefficient_is_used_as_given(two_ray: Path, tmp_path: Path, free_rms: float) -> None:
+    scenario = site(KNOWN, {})
+    known = scenario.model_dump(exclude_none=True) | {"reflection": {"model": "known", "coefficient": COEFFICIENT}}
+    path = tmp_path / "known.toml"
+    path.write_text(Scenario.model_validate(known).to_toml())
+    result = process(two_ray, tmp_path / "r.h5", scenario_path=path, estimator="correlator")
+    assert evaluate(result).normal_error_mrad.rms <= 1.3 * free_rms
+    assert result.reflection is not None
+    assert np.all(result.reflection.coefficient_sigma == 0.0)
+
+
+# -- bad transmitters ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(site(KNOWN, {}), tmp_path_factory.mktemp("clean"), "clean")
+
+
+def _interfered(clean: Path, path: Path, receivers: list[str], *, i_transmitter: int, relative: float) -> Path:
+    """Put a sine half a resolution beside a sideband of one transmitter into some receivers."""
+    path.write_bytes(clean.read_bytes())
+    scenario = load_scenario(clean.with_suffix(".toml"))
+    offset = scenario.carrier_hz[i_transmitter] + scenario.tone_hz[1] + 0.4 * 64e6 / 4000
+    with h5py.File(path, "r+") as file:
+        for receiver in receivers:
+            dataset = file[f"receivers/{receiver}/iq"]
+            iq = dataset[()]
+            wave = relative * np.abs(iq["r"]).max() * np.exp(2j * np.pi * offset / 64e6 * np.arange(len(iq)))
+            iq["r"] += np.rint(wave.real).astype("i2")
+            iq["i"] += np.rint(wave.imag).astype("i2")
+            dataset[...] = iq
+    return path
+
+
+def test_interference_is_left_out_with_its_reason(clean: Path, tmp_path: Path) -> None:
+    mirror = ["H02_r0", "H02_r1", "H02_r2"]
+    path = _interfered(clean, tmp_path / "jammed.h5", mirror, i_transmitter=3, relative=0.02)
+    result = process(path, tmp_path / "r.h5", estimator="correlator")
+    table = result.integrity
+    assert table is not None
+    # a sine pulls the phase by more or less, as the two happen to meet: what it spoils is left out
+    left_out = table.transmitter_status > TransmitterStatus.NOT_RECEIVED
+    assert left_out[:, 1, 3].sum() > N_FRAME / 2
+    left_out[:, 1, 3] = False
+    assert not left_out.any()
+    assert np.all(table.status[:, [0, 2, 3]] == IntegrityStatus.OK)
+    assert list(summarise(result)["integrity"]["excluded"]) == ["T4"]
+    assert list(summarise(result)["integrity"]["excluded"]["T4"]) == [TransmitterStatus.INTERFERENCE.reason]
+    found = evaluate(result)
+    assert found.failed == 0
+    # the sine is noise to the mirror's other transmitters too, which their sigma says
+    assert np.all(found.normal_error_rad < 4.5 * result.poses.sigma_rad)
+    assert found.protection is not None
+    assert found.protection.exceeded == 0
+    off = process(path, tmp_path / "off.h5", estimator="correlator", integrity=False)
+    assert off.integrity is None
+    assert off.settings["integrity"] == "off"
+
+
+def test_a_transmitter_elsewhere_than_surveyed_is_left_out(clean: Path, tmp_path: Path) -> None:
+    data = load_scenario(clean.with_suffix(".toml")).model_dump(exclude_none=True)
+    east, north, up = data["transmitter"][6]["position_enu_m"]
+    data["transmitter"][6]["position_enu_m"] = (east + 0.5, north, up)
+    (tmp_path / "moved.toml").write_text(Scenario.model_validate(data).to_toml())
+    result = process(clean, tmp_path / "r.h5", scenario_path=tmp_path / "moved.toml", estimator="correlator")
+    excluded = summarise(result)["integrity"]["excluded"]
+    assert list(excluded) == ["T7"]
+    assert sum(excluded["T7"].values()) == N_POSE
+    assert evaluate(result).normal_error_mrad.max < 0.01
+
+
+def test_a_pivot_that_contradicts_the_data_is_flagged_not_averaged(clean: Path, tmp_path: Path) -> None:
+    data = load_scenario(clean.with_suffix(".toml")).model_dump(exclude_none=True)
+    east, north, up = data["heliostat"][2]["pivot_enu_m"]
+    data["heliostat"][2]["pivot_enu_m"] = (east + 0.3, north, up)
+    (tmp_path / "off.toml").write_text(Scenario.model_validate(data).to_toml())
+    result = process(clean, tmp_path / "r.h5", scenario_path=tmp_path / "off.toml", estimator="correlator")
+    table = result.integrity
+    assert table is not None
+    assert np.all(table.prior_rejected[:, 2, 0])
+    assert not table.prior_rejected[:, [0, 1, 3]].any()
+    assert np.all(table.status[:, 2] == IntegrityStatus.PRIOR_REJECTED)
+    assert summarise(result)["integrity"]["priors_rejected"] == {"pivot": N_FRAME}
+    assert evaluate(result).normal_error_mrad.max < 0.01
+
+
+# -- drifting delays -----------------------------------------------------------------------------------------
+
+
+OUTER = ((70.0, 0.0), (-10.0, -80.0), (-60.0, 45.0), (45.0, 65.0))
+"""Where one clock is worth most."""
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    mirror = {"receiver_delay_drift_s_per_sqrt_min": 1e-12, "carrier_phase": False}
+    simulation = {
+        "frame_count": 60,
+        "frame_interval_s": 10.0,
+        "receiver_delay_s": 1e-9,
+        "receiver_delay_drift_s_per_sqrt_min": 1e-12,
+        "sun_azimuth_deg": (120.0, 240.0),
+        "path_loss": "none",
+        "tone_snr_db": 57.3,  # 0.97 mm of each range, as in the paper on a field of this size
+    }
+    scenario = site(mirror, simulation, tone_hz=(0.75e6,))
+    data = scenario.model_dump(exclude_none=True)
+    data["radio"]["frame_samples"] = 8000
+    for heliostat, pivot in zip(data["heliostat"], OUTER, strict=True):
+        heliostat["pivot_enu_m"] = (*pivot, 2.0)
+    scenario = Scenario.model_validate(data)
+    path = recorded(scenario, tmp_path_factory.mktemp("delays"), "drift")
+    return process(path, path.with_name("r.h5"), estimator="correlator")
+
+
+def test_learned_delays_reach_the_shared_clock(learned: Result) -> None:
+    assert learned.truth is not None
+    found = evaluate(learned)
+    assert found.failed == 0
+    data = learned.scenario.model_dump(exclude_none=True)
+    for heliostat in data["heliostat"]:
+        del heliostat["receiver_delay_drift_s_per_sqrt_min"]
+        heliostat["receiver_delay_sigma_s"] = 0.0
+    shared = normal_bound_rad(
+        Scenario.model_validate(data),
+        PoseChoice(pose="rigid", reflection="none", integrity=True),
+        phase_noise(learned, learned.truth, np.arange(60)),
+        normal_enu=learned.truth.normal_enu,
+        receiver_enu_m=learned.truth.receiver_enu_m,
+        frame_start_index=learned.frame_start_index,
+        sample_rate=learned.sample_rate,
+    )
+    late = slice(45, None)
+    error = np.sqrt(np.mean(found.normal_error_rad[late] ** 2))
+    assert error <= 1.3 * np.sqrt(np.mean(shared[late] ** 2))
+    assert np.sqrt(np.mean(found.normal_error_rad[0] ** 2)) > 1.5 * np.sqrt(np.mean(shared[0] ** 2))
+    # 240 mirror-frames whose learned part is common to neighbours: about 60 independent pairs of angles
+    assert found.ratio_to_bound == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * 120.0))
+
+
+def test_learned_covariance_and_delays_tell_the_truth(learned: Result) -> None:
+    assert learned.truth is not None
+    assert learned.delays is not None
+    error = np.linalg.norm(learned.poses.normal_enu - learned.truth.normal_enu, axis=-1)
+    ratio = error / learned.poses.sigma_rad
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * 120.0))
+    true = learned.truth.receiver_delay_s[:, :12].reshape(60, 4, 3)
+    true = (true - true[..., :1]).reshape(60, 12)
+    off = (learned.delays.delay_s[:, :12, 0] - true)[:, [1, 2, 4, 5, 7, 8, 10, 11]]
+    sigma = learned.delays.sigma_s[:, :12, 0][:, [1, 2, 4, 5, 7, 8, 10, 11]]
+    assert np.sqrt(np.mean((off / sigma)[-1] ** 2)) < 2.0
+    assert sigma[-1].max() < 0.7 * sigma[0].min()
+    assert not learned.delays.jumped.any()
+    assert np.all(np.isnan(learned.delays.delay_s[:, 12:]))
+
+
+def test_delays_learned_are_the_same_from_the_file(learned: Result, tmp_path: Path) -> None:
+    write_result(learned, tmp_path / "r.h5")
+    again = read_result(tmp_path / "r.h5")
+    assert again.delays is not None
+    assert learned.delays is not None
+    np.testing.assert_array_equal(again.delays.delay_s, learned.delays.delay_s)
+    assert evaluate(again).as_dict() == evaluate(learned).as_dict()
+
+
+# -- sites that cannot be right ------------------------------------------------------------------------------
+
+
+def _with(table: dict[str, Any]) -> Scenario:
+    return Scenario.model_validate(site({}, {}).model_dump(exclude_none=True) | table)
+
+
+def test_a_transmitter_below_the_ground_is_named() -> None:
+    with pytest.raises(GeometryError, match=r"transmitter `T1` lies 5 m behind reflector `ground`.*height_m"):
+        check_solvable(_with({"reflection": {"model": "estimate", "height_m": 25.0}}), pose="rigid")
+    wall = {"name": "wall", "point_enu_m": (0.0, 30.0, 0.0), "normal_enu": (0.0, 1.0, 0.0)}
+    with pytest.raises(GeometryError, match="behind reflector `wall`"):
+        check_solvable(_with({"reflection": {"model": "estimate", "plane": [wall]}}), pose="rigid")
+
+
+def test_two_mirrors_with_one_receiver_are_named() -> None:
+    data = site({}, {}).model_dump(exclude_none=True)
+    data["heliostat"][1]["receiver_ids"] = ("H02_r0", "H01_r1", "H02_r2")
+    with pytest.raises(ValueError, match="receiver `H01_r1` appears twice: .*heliostat `H01` and to heliostat `H02`"):
+        Scenario.model_validate(data)
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"model": "known"}, "coefficient"),
+        ({"model": "fresnel"}, "permittivity"),
+        ({"model": "estimate", "coefficient": (0.1, 0.0)}, "coefficient"),
+        ({"model": "known", "coefficient": (1.0, 0.5)}, "exceed one"),
+        ({"model": "estimate", "scaled": True}, "scaled"),
+        ({"model": "none", "plane": [{"name": "w", "point_enu_m": (0, 0, 0), "normal_enu": (1, 0, 0)}]}, "model"),
+        ({"model": "estimate", "normal_enu": (0.0, 0.0, 0.0)}, "must not be zero"),
+    ],
+)
+def test_contradictory_reflections_are_refused(table: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _with({"reflection": table})
+
+
+@pytest.mark.parametrize("mirror", [{"receiver_delay_sigma_s": 0.0}, {"oscillator": "separate"}])
+def test_delays_are_known_or_learned(mirror: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="receiver_delay_drift_s_per_sqrt_min"):
+        site({"receiver_delay_drift_s_per_sqrt_min": 1e-12, **mirror}, {})
+
+
+def test_independent_receivers_follow_no_such_choice() -> None:
+    with pytest.raises(InvalidInputError, match="`reflection` is of pose `rigid`"):
+        choose(site({}, {}), pose="independent", reflection="estimate")
+    with pytest.raises(InvalidInputError, match="`integrity` is of pose `rigid`"):
+        choose(site({}, {}), pose="independent", integrity=True)
+    assert choose(site({}, {}), pose="independent").integrity is False
