@@ -17,7 +17,20 @@ from rfpose.errors import RfposeError
 
 __all__ = ["app"]
 
-COMMANDS = ("demo", "simulate", "info", "process", "evaluate", "layout", "calibrate", "track", "convert", "view", "bench")
+COMMANDS = (
+    "demo",
+    "simulate",
+    "info",
+    "process",
+    "evaluate",
+    "layout",
+    "calibrate",
+    "aim",
+    "track",
+    "convert",
+    "view",
+    "bench",
+)
 
 EXIT_UNEXPECTED = 1
 EXIT_BAD_DATA = 3

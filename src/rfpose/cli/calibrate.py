@@ -23,48 +23,100 @@ _SHOWN_ALARMS = 12
     epilog=examples(
         "rfpose calibrate paint/ --heliostat BF57",
         "rfpose calibrate paint/ --parameters level-7 -o models.toml --picture errors.png",
+        "rfpose calibrate --mount planned.toml --radio night.h5 --motors motors.csv -o models.json",
+        "rfpose calibrate --mount planned.toml --radio night.h5 --motors motors.csv --camera pictures/",
+        "rfpose calibrate --mount planned.toml --drone flight.csv --parameters gouws-camera -o models.json",
     ),
 )
-@click.argument("directory", type=click.Path(path_type=Path))
+@click.argument("directory", type=click.Path(path_type=Path), required=False)
+@click.option("--mount", "mounts", type=click.Path(path_type=Path), help="Mounts as planned or calibrated before.")
+@click.option("--radio", multiple=True, type=click.Path(path_type=Path), help="Result of `process`; may be repeated.")
+@click.option("--motors", type=click.Path(path_type=Path), help="CSV of motor positions for --radio.")
+@click.option("--camera", type=click.Path(path_type=Path), help="Folder of pictures, pictures.csv and board.toml.")
+@click.option("--drone", type=click.Path(path_type=Path), help="CSV of a drone's log.")
 @click.option("--heliostat", "heliostats", multiple=True, metavar="ID", help="Only this one; may be repeated.")
 @click.option(
     "--parameters",
-    default="level-full",
-    show_default=True,
     metavar="SET",
-    help="Free parameters: a set's name, or names with commas between.",
+    help="Free parameters: a set's name, or names with commas between. Default: level-full for PAINT, else edwards-4.",
 )
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="Write the models: .json or .toml.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the errors: .png, .pdf, .svg.")
 @force_option
 @common_options
 def command(
-    directory: Path,
+    directory: Path | None,
+    mounts: Path | None,
+    radio: tuple[Path, ...],
+    motors: Path | None,
+    camera: Path | None,
+    drone: Path | None,
     heliostats: tuple[str, ...],
-    parameters: str,
+    parameters: str | None,
     output: Path | None,
     picture: Path | None,
     force: bool,
 ) -> None:
-    """Fit the mounts of a PAINT directory and say how far to trust them.
+    """Fit mounts to a PAINT directory or to poses, pictures and flights, and say how far to trust them.
 
     Errors are of the mirror normal; the beam's are twice that. Held-out: ten random splits, 60 % fitted, 40 % judged.
+    Radio poses need motor positions, and a second source to tell the receivers' plane from the mirror.
     """
-    from rfpose.pipeline.calibrate import calibrate_paint, draw_errors, write_models
+    if (directory is None) == (mounts is None):
+        raise click.UsageError("give either a PAINT DIRECTORY, or --mount with --radio, --camera or --drone")
+    if directory is not None and (radio or camera or drone):
+        raise click.UsageError("--radio, --camera and --drone go with --mount; write one with -o from PAINT first")
+    if mounts is not None and not (radio or camera or drone):
+        raise click.UsageError("--mount needs measurements: --radio, --camera or --drone")
+    if bool(radio) != (motors is not None):
+        raise click.UsageError("--radio and --motors belong together: a pose alone does not say what the motors did")
 
-    free = tuple(parameters.split(",")) if "," in parameters or parameters.endswith(("_rad", "_m")) else parameters
-    reports = calibrate_paint(directory, heliostats=heliostats, free=free)
+    from rfpose.pipeline.calibrate import draw_errors, write_models
+
+    words = parameters or ("level-full" if mounts is None else "edwards-4")
+    free = tuple(words.split(",")) if "," in words or words.endswith(("_rad", "_m")) else words
+    reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free)
     if output is not None:
-        write_models(output, reports, force=force)
+        write_models(output, reports, settings={"parameters": words}, force=force)
     if picture is not None:
         draw_errors(picture, reports)
     if wants_json():
-        emit_json({"heliostats": [report.as_dict() for report in reports], "parameters": parameters})
+        emit_json({"heliostats": [report.as_dict() for report in reports], "parameters": words})
         return
     _show(reports)
     for path in (output, picture):
         if path is not None:
             say(f"wrote {path}")
+
+
+def _fit(
+    directory: Path | None,
+    mounts: Path | None,
+    radio: tuple[Path, ...],
+    motors: Path | None,
+    camera: Path | None,
+    drone: Path | None,
+    heliostats: tuple[str, ...],
+    free: str | tuple[str, ...],
+) -> tuple[HeliostatReport, ...]:
+    """Read what was named and fit it."""
+    from rfpose.pipeline.calibrate import calibrate_mounts, calibrate_paint
+    from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_radio
+    from rfpose.pipeline.mount_file import read_models
+
+    if directory is not None:
+        return calibrate_paint(directory, heliostats=heliostats, free=free)
+    assert mounts is not None
+    planned = read_models(mounts)
+    known = {name: stored.mount for name, stored in planned.heliostats.items()}
+    gathered = []
+    if motors is not None:
+        gathered.append(read_radio(radio, motors))
+    if camera is not None:
+        gathered.append(read_camera(camera, known, planned.site))
+    if drone is not None:
+        gathered.append(read_drone(drone, known))
+    return calibrate_mounts(planned, gathered, heliostats=heliostats, free=free)
 
 
 def _show(reports: tuple[HeliostatReport, ...]) -> None:
@@ -73,8 +125,8 @@ def _show(reports: tuple[HeliostatReport, ...]) -> None:
     rows = [
         [
             item["heliostat"],
-            f"{item['used']}/{item['records'] + len(item['skipped'])}",
-            *(f"{item[key]:.3f}" for key in ("train_median_mrad", "held_out_median_mrad", "chronological_median_mrad")),
+            f"{item['used']}/{item['records'] + (len(item['skipped']) if 'PAINT' in item['sources'] else 0)}",
+            *(_number(item[key]) for key in ("train_median_mrad", "held_out_median_mrad", "chronological_median_mrad")),
             f"{item['rank']}/{len(item['parameters'])}",
             str(len(item["alarms"])),
         ]
@@ -89,8 +141,11 @@ def _show(reports: tuple[HeliostatReport, ...]) -> None:
         table(f"{item['heliostat']}: parameters", ["", "estimate", "sigma", "unit"], values)
         for group in item["undetermined"]:
             say(f"  undetermined, the data cannot tell apart: {', '.join(group)}")
-        for number, reason in item["skipped"].items():
-            say(f"  record {number} left out: {reason}")
+        for note in item["notes"]:
+            say(f"  note: {note}")
+        if "PAINT" in item["sources"] or item is plain[-1]:
+            for number, reason in list(item["skipped"].items())[:_SHOWN_ALARMS]:
+                say(f"  record {number} left out: {reason}")
         outliers = [alarm for alarm in item["alarms"] if alarm["kind"] == "outlier"]
         if outliers:
             say(f"  {len(outliers)} records are off by more than 5 mrad, first {outliers[0]['first_record']}")
@@ -101,6 +156,10 @@ def _show(reports: tuple[HeliostatReport, ...]) -> None:
             else:
                 last = alarm["last_record"]
                 say(f"  axis {axis} drifts by {size:+.1f} mrad, records {alarm['first_record']} to {last}")
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
 
 
 def _shown(name: str, estimate: float, sigma: float) -> list[str]:

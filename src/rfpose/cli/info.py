@@ -15,12 +15,17 @@ __all__ = ["command"]
 
 @click.command(
     name="info",
-    epilog=examples("rfpose info recording.h5", "rfpose info result.h5 --json", "rfpose info site.toml"),
+    epilog=examples(
+        "rfpose info recording.h5",
+        "rfpose info result.h5 --json",
+        "rfpose info site.toml",
+        "rfpose info models.json",
+    ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
 @common_options
 def command(file: Path) -> None:
-    """Say what a recording, a result or a scenario holds and whether it is sound."""
+    """Say what a recording, a result, a scenario or a file of mounts holds and whether it is sound."""
     from rfpose.pipeline.inspect import inspect_file
 
     found = inspect_file(file)

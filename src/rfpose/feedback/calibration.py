@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,7 @@ __all__ = [
     "FieldCalibration",
     "FitSettings",
     "FitStatus",
+    "Known",
     "Prediction",
     "RowStatus",
     "fit",
@@ -54,6 +56,11 @@ PARAMETER_SETS: dict[str, tuple[str, ...]] = {
     "malan": (*_PEDESTAL, *_ZEROS, "nonorthogonality_rad", *_LOCATION),
     "gouws": (
         *_LOCATION, *_PEDESTAL, *_ZEROS, "arm_normal_m", "arm_up_m",
+    ),
+    # his tenth, in three components: where the drone's camera sits
+    "gouws-camera": (
+        *_LOCATION, *_PEDESTAL, *_ZEROS, "arm_normal_m", "arm_up_m", "drone_camera_east_m", "drone_camera_north_m",
+        "drone_camera_up_m",
     ),
     "level-4": (*_LEVEL, *_ZEROS),
     "level-7": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES),
@@ -240,9 +247,46 @@ class Calibration:
         return dict(zip(self.free, self.field.sigma[0].tolist(), strict=True))
 
     @property
+    def covariance(self) -> FloatArray:
+        """Of the free parameters, on the subspace that the data determine (free, free)."""
+        return np.asarray(self.field.covariance[0])
+
+    @property
+    def ambiguity(self) -> FloatArray:
+        """Projection onto what is undetermined (free, free)."""
+        return np.asarray(self.field.ambiguity[0])
+
+    @property
+    def column_length(self) -> FloatArray:
+        """Lengths of the Jacobian's columns (free,)."""
+        return np.asarray(self.field.column_length[0])
+
+    @property
+    def noise_rad(self) -> float:
+        """Standard deviation of one measured normal, one component, about the model [rad]."""
+        return float(self.field.noise[0] * np.median(self.measurements.sigma_rad))
+
+    @property
     def used(self) -> npt.NDArray[np.bool_]:
         """Which measurements took part."""
         return np.asarray(self.row_status == RowStatus.USED)
+
+
+class Known(Protocol):
+    """What is known of a mount: a `Calibration`, or one read back from a file."""
+
+    @property
+    def mount(self) -> Mount: ...  # noqa: D102
+    @property
+    def free(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def covariance(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def ambiguity(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def column_length(self) -> FloatArray: ...  # noqa: D102
+    @property
+    def noise_rad(self) -> float: ...  # noqa: D102
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -579,7 +623,7 @@ def normal_differences(mount: Mount, measurements: Measurements) -> FloatArray:
     return residual * measurements.sigma_rad[:, None]
 
 
-def predict(calibration: Calibration, postures: Measurements) -> Prediction:
+def predict(calibration: Known, postures: Measurements) -> Prediction:
     """Return modelled normals of postures with the uncertainty that the parameters leave.
 
     Parameters
@@ -591,7 +635,7 @@ def predict(calibration: Calibration, postures: Measurements) -> Prediction:
         a place and a zero that were fitted together make up for each other, and what matters is their sum.
     """
     jacobian = posture_jacobian(calibration.mount, postures, calibration.free)
-    covariance = jacobian @ calibration.field.covariance[0] @ np.swapaxes(jacobian, -1, -2)
+    covariance = jacobian @ calibration.covariance @ np.swapaxes(jacobian, -1, -2)
     p, k = stack_mounts([calibration.mount])
     normal = _kernels.posture_batch(p, k, postures.count.copy()[None], 0.0)[0, :, 2:5]
     return Prediction(

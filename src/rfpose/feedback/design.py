@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.calibration import Calibration, posture_jacobian, predict
+from rfpose.feedback.calibration import Known, posture_jacobian, predict
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import PARAMETERS, Commands, command
 from rfpose.feedback.sun import Site, Sun, sun_position
@@ -57,7 +57,7 @@ class Forecast:
 
 
 def next_postures(
-    calibration: Calibration,
+    calibration: Known,
     candidates: Measurements,
     *,
     n_posture: int,
@@ -80,7 +80,7 @@ def next_postures(
     if n_posture < 1:
         raise InvalidInputError(f"`n_posture` must be one or more, got {n_posture}")
     usual = np.array([PARAMETERS[name] for name in calibration.free])
-    covariance = calibration.field.covariance[0] / np.outer(usual, usual)
+    covariance = calibration.covariance / np.outer(usual, usual)
     covariance = covariance + 100.0**2 * _scaled_ambiguity(calibration, usual)
     jacobian = posture_jacobian(calibration.mount, candidates, calibration.free) * usual
     if not np.all(np.isfinite(jacobian)):
@@ -105,20 +105,20 @@ def next_postures(
     return Design(chosen=np.array(chosen, np.int64), trace=np.array(trace))
 
 
-def _scaled_ambiguity(calibration: Calibration, usual: FloatArray) -> FloatArray:
+def _scaled_ambiguity(calibration: Known, usual: FloatArray) -> FloatArray:
     """Projection onto the undetermined combinations, in usual sizes of the parameters."""
-    values, vectors = np.linalg.eigh(calibration.field.ambiguity[0])
+    values, vectors = np.linalg.eigh(calibration.ambiguity)
     null = vectors[:, values > 0.5]
     if not null.shape[1]:
         return np.zeros((len(usual), len(usual)))
     # the projection is for columns of length one: go back to parameters, then to usual sizes
-    lengths = calibration.field.column_length[0]
+    lengths = calibration.column_length
     basis, _ = np.linalg.qr(null / (lengths * usual)[:, None])
     return np.asarray(basis @ basis.T)
 
 
 def forecast(
-    calibration: Calibration,
+    calibration: Known,
     *,
     site: Site,
     unix_s: npt.ArrayLike,
@@ -153,10 +153,9 @@ def forecast(
     sigma = np.full(len(good), np.nan)
     if good.any():
         sigma[good] = predict(calibration, postures.take(good)).sigma_rad
-    noise = calibration.field.noise[0] * float(np.median(calibration.measurements.sigma_rad))
     return Forecast(
         sun=sun,
         commands=Commands(count=count, status=wanted.status),
         sigma_normal_rad=sigma,
-        sigma_total_rad=np.sqrt(sigma**2 + 2.0 * noise**2),
+        sigma_total_rad=np.sqrt(sigma**2 + 2.0 * calibration.noise_rad**2),
     )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.pipeline.choice import POSES
+from rfpose.pipeline.mount_file import is_model, read_models
 from rfpose.pipeline.result_file import frame_time, is_result, read_result, summarise
 from rfpose.pipeline.solve import check_solvable
 from rfpose.recording import describe, open_recording
@@ -16,12 +18,13 @@ __all__ = ["inspect_file"]
 
 
 def inspect_file(path: str | Path) -> dict[str, Any]:
-    """Describe a recording, a result or a scenario, ready for JSON.
+    """Describe a recording, a result, a scenario or a file of mounts, ready for JSON.
 
     Returns
     -------
     dict
-        ``kind`` is ``"recording"``, ``"result"`` or ``"scenario"``; ``sound`` tells whether ``problems`` is empty.
+        ``kind`` is ``"recording"``, ``"result"``, ``"scenario"`` or ``"model"`` (mounts); ``sound`` tells whether
+        ``problems`` is empty.
 
     Raises
     ------
@@ -29,6 +32,8 @@ def inspect_file(path: str | Path) -> dict[str, Any]:
         The file is missing, damaged or none of these.
     """
     path = Path(path)
+    if path.suffix in (".json", ".toml") and is_model(path):
+        return {"kind": "model", "path": str(path), **_models(path)}
     if path.suffix == ".toml":
         return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
     if path.is_file() and is_result(path):
@@ -78,6 +83,33 @@ def _result(path: Path) -> dict[str, Any]:
         "last_frame_utc": times[1],
         **{key: value for key, value in summary.items() if key not in ("estimator", "pose")},
         "has_truth": result.truth is not None,
+        "problems": problems,
+        "sound": not problems,
+    }
+
+
+def _models(path: Path) -> dict[str, Any]:
+    content = read_models(path)
+    site = content.site
+    problems = [
+        f"{name}: {', '.join(group)} were not told apart"
+        for name, stored in content.heliostats.items()
+        for group in stored.undetermined
+    ]
+    return {
+        "made_by": dict(content.made_by),
+        "site_deg": None if site is None else [math.degrees(site.latitude_rad), math.degrees(site.longitude_rad)],
+        "heliostats": {
+            name: {
+                "pivot_enu_m": stored.mount.pivot_enu_m.tolist(),
+                "actuators": [actuator.kind for actuator in stored.mount.actuators],
+                "calibrated": stored.calibrated,
+                "parameters": sum(value != 0.0 for value in stored.mount.parameters.values()),
+                "free": len(stored.free),
+                "noise_mrad": 1e3 * stored.noise_rad,
+            }
+            for name, stored in content.heliostats.items()
+        },
         "problems": problems,
         "sound": not problems,
     }

@@ -1,0 +1,256 @@
+"""Measurements of heliostats out of files: radio poses, pictures of a target, a drone's log.
+
+Tables are CSV with a header; motor positions are ``axis_1`` and ``axis_2`` in the mount's counts, times ISO 8601 with
+their zone.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import tomllib
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.feedback.camera.malan import Board, find_spot
+from rfpose.feedback.camera.model import spot_sigma_rad, spots_enu_m
+from rfpose.feedback.camera.spot import SpotStatus, read_picture
+from rfpose.feedback.drone import drone_sigma_rad
+from rfpose.feedback.measurements import Measurements
+from rfpose.feedback.mount import Mount
+from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.multilat import PoseStatus
+from rfpose.pipeline.result_file import frame_time, read_result
+
+__all__ = ["Gathered", "read_camera", "read_drone", "read_radio"]
+
+BOARD_NAME, PICTURES_NAME = "board.toml", "pictures.csv"
+_SPOT_SIGMA_M = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Gathered:
+    """One source's measurements, by heliostat.
+
+    Attributes
+    ----------
+    source
+        ``"radio"``, ``"camera"`` or ``"drone"``.
+    measurements
+        By heliostat's name.
+    left_out
+        Why rows were left out, by what names them.
+    """
+
+    source: str
+    measurements: Mapping[str, Measurements]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+
+
+def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
+    """Take solved poses of results, each with the motor positions that were logged nearest to its frame.
+
+    Parameters
+    ----------
+    results
+        Files that ``rfpose process`` wrote.
+    motors
+        CSV: time_utc, heliostat, axis_1, axis_2.
+    within_s
+        A log entry further from the frame than this does not count [s].
+    """
+    log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
+    for row in _rows(motors, ("time_utc", "heliostat", "axis_1", "axis_2")):
+        log[row.text["heliostat"]].append((row.unix_s, row.number("axis_1"), row.number("axis_2")))
+    table = {name: np.array(sorted(entries)) for name, entries in log.items()}
+    kept: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+    left_out = {}
+    for path in results:
+        result = read_result(path)
+        for i, start in enumerate(result.frame_start_index):
+            length = result.scenario.radio.frame_samples / result.scenario.radio.sample_rate_hz
+            unix_s = frame_time(int(start), result.sample_rate).timestamp() + 0.5 * length
+            for h, name in enumerate(result.scenario.heliostat_ids):
+                status = PoseStatus(int(result.poses.status[i, h]))
+                if not np.isfinite(result.poses.normal_enu[i, h]).all():
+                    left_out[f"{path.name} frame {i} {name}"] = status.reason
+                    continue
+                entry = _nearest(table.get(name), unix_s, within_s)
+                if entry is None:
+                    left_out[f"{path.name} frame {i} {name}"] = f"no motor position within {within_s:g} s"
+                    continue
+                sigma = max(float(result.poses.sigma_rad[i, h]) / math.sqrt(2.0), 1e-7)
+                kept[name].append((unix_s, entry[1], entry[2], *result.poses.normal_enu[i, h], sigma))
+    if not kept:
+        why = next(iter(left_out.values()), "no pose at all")
+        raise RecordingError(f"{motors}: no pose has a motor position: {why}; check times and heliostats' names")
+    return Gathered(
+        source="radio",
+        measurements={
+            name: Measurements.from_normals(
+                np.array(rows)[:, 1:3],
+                normal_enu=np.array(rows)[:, 3:6],
+                sigma_rad=np.array(rows)[:, 6],
+                receiver_plane=True,
+                unix_s=np.array(rows)[:, 0],
+            )
+            for name, rows in kept.items()
+        },
+        left_out=left_out,
+    )
+
+
+def _nearest(entries: Any, unix_s: float, within_s: float) -> Any:
+    if entries is None:
+        return None
+    i = int(np.argmin(np.abs(entries[:, 0] - unix_s)))
+    return entries[i] if abs(entries[i, 0] - unix_s) <= within_s else None
+
+
+def read_drone(path: Path, mounts: Mapping[str, Mount]) -> Gathered:
+    """Take a drone's log: from where it saw which target in which mirror.
+
+    Parameters
+    ----------
+    path
+        CSV: heliostat, axis_1, axis_2, drone_east_m, drone_north_m, drone_up_m, target_east_m, target_north_m,
+        target_up_m; time_utc if known.
+    mounts
+        For the distances that the noise depends on.
+    """
+    names = ("heliostat", "axis_1", "axis_2", *_enu("drone"), *_enu("target"))
+    parts: dict[str, list[list[float]]] = defaultdict(list)
+    for i, row in enumerate(_rows(path, names)):
+        unix_s = row.unix_s if "time_utc" in row.text else float(i)
+        parts[row.text["heliostat"]].append([unix_s, *(row.number(name) for name in names[1:])])
+    made = {}
+    for name, rows in parts.items():
+        table = np.array(rows)
+        sigma = drone_sigma_rad(table[:, 3:6], _pivot(path, mounts, name), target_enu_m=table[:, 6:9])
+        made[name] = Measurements.from_points(
+            table[:, 1:3], source_enu_m=table[:, 3:6], target_enu_m=table[:, 6:9], sigma_rad=sigma, unix_s=table[:, 0]
+        )
+    return Gathered(source="drone", measurements=made)
+
+
+def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) -> Gathered:
+    """Take a folder of pictures of a target with one heliostat's beam each.
+
+    Parameters
+    ----------
+    folder
+        With ``pictures.csv`` (file, time_utc, heliostat, axis_1, axis_2) and ``board.toml``: centre_enu_m and
+        normal_enu of the target, width_m, height_m, marker_centres_m; if wanted mm_per_px, corners_px, shape_px,
+        spot_sigma_m.
+    mounts
+        For the distances that the noise depends on.
+    site
+        For the sun.
+    """
+    if site is None:
+        raise InvalidInputError(
+            f"{folder}: pictures need the sun: add [site] with latitude_deg, longitude_deg to the mounts"
+        )
+    centre, normal, board, spot_sigma_m = _board(folder / BOARD_NAME)
+    left_out = {}
+    parts: dict[str, list[list[float]]] = defaultdict(list)
+    for row in _rows(folder / PICTURES_NAME, ("file", "time_utc", "heliostat", "axis_1", "axis_2")):
+        spot = find_spot(read_picture(folder / row.text["file"]), board)
+        if spot.status != SpotStatus.OK:
+            left_out[row.text["file"]] = f"{spot.status.name.lower().replace('_', ' ')}: {spot.text}"
+            continue
+        place = spots_enu_m(spot.centre_m, target_enu_m=centre, target_normal_enu=normal)
+        parts[row.text["heliostat"]].append([row.unix_s, row.number("axis_1"), row.number("axis_2"), *place])
+    if not parts:
+        why = "; ".join(f"{name}: {text}" for name, text in list(left_out.items())[:3])
+        raise RecordingError(f"{folder}: no picture holds a beam ({why or 'the table is empty'})")
+    made = {}
+    for name, rows in parts.items():
+        table = np.array(rows)
+        distance = np.linalg.norm(table[:, 3:6] - _pivot(folder, mounts, name), axis=1)
+        made[name] = Measurements.from_spots(
+            table[:, 1:3],
+            sun_enu=sun_position(table[:, 0], site).direction_enu,
+            spot_enu_m=table[:, 3:6],
+            sigma_rad=spot_sigma_rad(spot_sigma_m, distance),
+            unix_s=table[:, 0],
+        )
+    return Gathered(source="camera", measurements=made, left_out=left_out)
+
+
+def _board(path: Path) -> tuple[list[float], list[float], Board, float]:
+    """Place and shape of the target."""
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordingError(
+            f"{path}: is missing; it says where the target stands and where its markers are"
+        ) from error
+    except ValueError as error:
+        raise RecordingError(f"{path}: is no TOML ({error})") from error
+    try:
+        centre, normal = table.pop("centre_enu_m"), table.pop("normal_enu")
+        sigma = float(table.pop("spot_sigma_m", _SPOT_SIGMA_M))
+        board = Board(**{key: _tuples(value) for key, value in table.items()})
+    except KeyError as error:
+        raise RecordingError(f"{path}: {error} is missing") from error
+    except (TypeError, InvalidInputError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    return centre, normal, board, sigma
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def _enu(what: str) -> tuple[str, ...]:
+    return tuple(f"{what}_{axis}_m" for axis in ("east", "north", "up"))
+
+
+def _pivot(path: Path, mounts: Mapping[str, Mount], name: str) -> Any:
+    if name not in mounts:
+        raise RecordingError(f"{path}: heliostat {name!r} has no mount; known are {', '.join(list(mounts)[:8])}")
+    return mounts[name].pivot_enu_m
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """A line of a table that knows where it stands."""
+
+    place: str
+    text: Mapping[str, str]
+
+    def number(self, name: str) -> float:
+        try:
+            return float(self.text[name])
+        except ValueError as error:
+            raise RecordingError(f"{self.place}: {name} must be a number, got {self.text[name]!r}") from error
+
+    @property
+    def unix_s(self) -> float:
+        try:
+            return float(unix_seconds([self.text["time_utc"]])[0])
+        except InvalidInputError as error:
+            raise RecordingError(f"{self.place}: {error}") from error
+
+
+def _rows(path: Path, names: Sequence[str]) -> list[_Row]:
+    """Lines of a CSV file that has certain columns."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in names if name not in (reader.fieldnames or ())]
+            if missing:
+                raise RecordingError(f"{path}: has no column {missing[0]}; needed are {', '.join(names)}")
+            rows = [_Row(f"{path} line {reader.line_num}", {k: v or "" for k, v in row.items() if k}) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path}: cannot be read as CSV ({error})") from error
+    if not rows:
+        raise RecordingError(f"{path}: holds no line below its header")
+    return rows
