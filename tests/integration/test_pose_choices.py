@@ -298,7 +298,7 @@ def test_a_transmitter_below_the_ground_is_named() -> None:
 def test_two_mirrors_with_one_receiver_are_named() -> None:
     data = site({}, {}).model_dump(exclude_none=True)
     data["heliostat"][1]["receiver_ids"] = ("H02_r0", "H01_r1", "H02_r2")
-    with pytest.raises(ValueError, match="receiver `H01_r1` appears twice: .*heliostat `H01` and to heliostat `H02`"):
+    with pytest.raises(ValueError, match=r"receiver `H01_r1` appears twice: .*heliostat `H01` and to heliostat `H02`"):
         Scenario.model_validate(data)
 
 
