@@ -94,7 +94,7 @@ def _say(summary: dict[str, Any]) -> None:
     for name, values in summary["normal_mrad"].items():
         rows.append([f"normal, {name} [mrad]", *_cells(values), f"{100.0 * values['undetermined']:.3g} %"])
     title = f"{summary['scenario']}: {summary['heliostats']} heliostats, {summary['postures']} posture(s)"
-    table(title, ["bound", "rms", "median", "95 %", "worst", "undetermined"], rows)
+    table(title, ["bound", "rms", "median", "95 %", "worst", "unsolved"], rows)
     sight = summary.get("line_of_sight")
     if sight is not None:
         say(f"a receiver sees {sight['seen_mean']:.3g} transmitters on average, {sight['seen_least']:g} at the least")

@@ -330,7 +330,7 @@ def draw_layout_map(found: LayoutMap, path: str | Path, *, estimator: str | None
     axes.set_ylabel("north [m]")
     axes.set_aspect("equal")
     axes.grid(alpha=0.3)
-    seen = ", line of sight counted" if found.sight is not None else ""
+    seen = "\n(what each receiver sees past plates and tower)" if found.sight is not None else ""
     axes.set_title(f"{found.scenario.name}: {name}, RMS {summarise(mrad)['rms']:.3g} mrad over the field{seen}")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     _save(figure, path)
