@@ -111,7 +111,13 @@ def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
     assert sight["seen_least"] == seen.sum(axis=2).min()
     assert found["normal_mrad"]["shared-clock"]["undetermined"] == pytest.approx(np.isnan(bound).mean())
     assert found["normal_mrad"]["shared-clock"]["rms"] == pytest.approx(1e3 * np.sqrt(np.nanmean(bound**2)))
-    assert min(found["normal_without_transmitter_mrad"]["shared-clock"].values()) > 0.0
+    masked = seen.copy()
+    masked[..., 3] = False
+    without = maps.normal_map(
+        scenario.transmitter_enu_m, mirrors, maps.noise_of(scenario), ESTIMATORS["shared-clock"], visible=masked
+    )
+    lost = found["normal_without_transmitter_mrad"]["shared-clock"][scenario.transmitter_ids[3]]
+    assert lost == pytest.approx(1e3 * np.sqrt(np.nanmean(without**2)), rel=1e-6)
     with table.open() as file:
         assert [float(row["seen_least"]) for row in csv.DictReader(file)] == seen.sum(axis=2).min(axis=1).tolist()
     behind = json.loads(run("map", SITE, "--json", "--behind", *plate))["line_of_sight"]

@@ -186,3 +186,11 @@ def test_what_cannot_be_budgeted_is_refused():
     mixed["heliostat"][0]["pivot_sigma_m"] = 0.01
     with pytest.raises(GeometryError, match="pivot survey"):
         plan_of(Scenario.model_validate(mixed))
+
+
+def test_a_larger_site_has_larger_lengths():
+    small = site(budget={"transmitter_survey_sigma_m": 0.002, "receiver_delay_sigma_s": 1e-12})
+    large = small.scaled(2.0).budget
+    assert large.transmitter_survey_sigma_m == 0.004
+    assert large.multipath_excess_m == 2.0 * small.budget.multipath_excess_m
+    assert large.receiver_delay_sigma_s == 1e-12
