@@ -375,13 +375,15 @@ def design_law(
     # unity gain anywhere below the first frequency whose lag leaves too little
     enough = np.flatnonzero(phase + np.pi >= least_phase_rad)
     crossover = _crossing(frequency, phase, -np.pi)
-    if not enough.size or np.isnan(crossover):
+    if not enough.size:
         raise InvalidInputError(
             f"`integral_ratio_per_s` {integral_ratio_per_s:g} must be lower: no gain keeps {least_gain:g} and "
             f"{np.rad2deg(least_phase_rad):.0f}° at {latency_s:g} s latency"
         )
     by_phase = 1.0 / float(size[enough[-1]])
-    by_gain = 1.0 / (least_gain * float(np.interp(np.log(crossover), np.log(frequency), size)))
+    # a lag that stays below half a turn reaches it at half the sampling rate, where everything is real
+    turned = frequency[-1] if np.isnan(crossover) else crossover
+    by_gain = 1.0 / (least_gain * float(np.interp(np.log(turned), np.log(frequency), size)))
     gain = min(by_phase, by_gain)
     return dataclasses.replace(base, gain_per_s=gain, integral_gain_per_s2=integral_ratio_per_s * gain)
 

@@ -120,8 +120,10 @@ def gust_process(
     wanted = gust_spectrum(frequency, speed, roughness=roughness) * admittance(frequency, speed, size_m=size_m)
     plain = _spectra(frequency, slow_s * _TIMES)
     both = np.concatenate([plain, plain * _quick(frequency, slow_s)[:, None]], axis=1)
-    # relative errors, so that weak high frequencies count as much as strong low ones
-    variance, _ = nnls(both / wanted[:, None], np.ones_like(frequency))
+    # relative errors, frequencies with a hundredth of the power at a tenth of the weight: what a plate averages away
+    # falls faster than any first-order process does
+    weight = np.sqrt(frequency * wanted / np.max(frequency * wanted))
+    variance, _ = nnls(both * (weight / wanted)[:, None], weight)
     used = np.flatnonzero(variance > 0.0)
     strength = 0.0 if speed_mps == 0.0 else 1.0
     return GustProcess(
