@@ -94,7 +94,7 @@ def _show(plan: Plan) -> None:
     rows = [
         [
             f"{row['time_utc'][5:10]} {row['time_utc'][11:16]}",
-            *(_number(row[name]) for name in ("axis_1", "axis_2")),
+            *(_number(row[name], 8) for name in ("axis_1", "axis_2")),
             *(_number(row[name]) for name in ("normal_sigma_mrad", "normal_with_noise_mrad")),
             row["status"],
         ]
@@ -110,10 +110,10 @@ def _show(plan: Plan) -> None:
     say(f"  open over the year, on the 21st [mrad of the normal]: {text}")
     for item in told["next"]:
         say(
-            f"  measure next: {item['time_utc']} at {_number(item['axis_1'])}, {_number(item['axis_2'])}; "
+            f"  measure next: {item['time_utc']} at {_number(item['axis_1'], 8)}, {_number(item['axis_2'], 8)}; "
             f"leaves {_number(item['sigma_after_mrad'])} mrad over the year"
         )
 
 
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.6g}"
+def _number(value: float, digits: int = 3) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}g}"

@@ -651,8 +651,8 @@ def posture_jacobian(mount: Mount, postures: Measurements, free: tuple[str, ...]
     row = postures.row.copy()
     row[:, 8] = 1.0
     p, k = stack_mounts([mount])
-    index = np.array([list(PARAMETERS).index(name) for name in free])
-    scale = np.array([PARAMETERS[name] for name in free])
+    index = np.array([list(PARAMETERS).index(name) for name in free], np.int64)
+    scale = np.array([PARAMETERS[name] for name in free], np.float64)
     use = np.ones((1, len(postures)), np.bool_)
     count = postures.count.copy()
     jacobian: FloatArray = _kernels.jacobian_batch(p, k, count[None], row[None], use, index, scale)[0]

@@ -226,7 +226,7 @@ def _status(status: int, sun_elevation_rad: float) -> str:
     if sun_elevation_rad <= 0.0:
         return "sun down"
     return {CommandStatus.OK: "ok", CommandStatus.NO_SOLUTION: "out of reach"}.get(
-        CommandStatus(status), "beyond the motors' limits"
+        CommandStatus(status), "beyond limits"
     )
 
 
