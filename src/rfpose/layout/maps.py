@@ -240,7 +240,8 @@ def dilution(
         raise InvalidInputError(f"`transmitter_enu_m` must have two or three columns, got {n_axis}")
     point = as_float_array("point_enu_m", point_enu_m, ("...", n_axis), finite=False)
     lead = point.shape[:-1]
-    flat = point.reshape(-1, n_axis)
+    # a copy: a read-only array would be another type to the kernels, compiled anew
+    flat = np.array(point.reshape(-1, n_axis))
     if n_axis == 2:
         variance = _planar(transmitter, flat, visible)
     else:
