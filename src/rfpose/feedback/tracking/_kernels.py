@@ -62,18 +62,6 @@ class Loop(NamedTuple):
     """Radius of the sun's image on a unit distance, half [rad] (Malan 3.3)."""
 
 
-@kernel_parallel
-def gusts(state, keep, kick, noise, out):
-    """Sum of first-order processes driven by ``noise`` (mirror, step, process), in m/s (mirror, step)."""
-    for h in nb.prange(state.shape[0]):
-        for t in range(noise.shape[1]):
-            total = 0.0
-            for i in range(state.shape[1]):
-                state[h, i] = keep[i] * state[h, i] + kick[i] * noise[h, t, i]
-                total += state[h, i]
-            out[h, t] = total
-
-
 @kernel
 def _caught(error, disc):
     """Intercept ratio of two discs (Malan 3.3)."""

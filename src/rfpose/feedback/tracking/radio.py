@@ -195,6 +195,10 @@ class RadioModel:
             two_axis=kind.mount == "azimuth_elevation",
         )
 
+    def _spreads(self) -> bool:
+        """Whether the longer ray is the weaker one."""
+        return self._scenario.simulation.path_loss == "free_space"
+
     # -- reflections ---------------------------------------------------------------------------------------
 
     def _neighbours(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
@@ -222,6 +226,7 @@ class RadioModel:
                 reflectors=[mirror],
                 carrier_rf_hz=scenario.radio.centre_frequency_hz + scenario.carrier_hz,
                 tone_hz=tone_hz,
+                free_space=self._spreads(),
                 propagation_speed_mps=scenario.radio.propagation_speed_mps,
             )
 
@@ -260,6 +265,7 @@ class RadioModel:
             reflectors=(Reflector(point_enu_m=(0.0, 0.0, ground.height_m)),) if estimate else (),
             calibration_enu_m=self._scenario.calibration_enu_m if self._scenario.calibration_receiver else None,
             knowledge=self._knowledge(pivot),
+            free_space=self._spreads(),
             propagation_speed_mps=self._scenario.radio.propagation_speed_mps,
             min_probability=0.0,
         )

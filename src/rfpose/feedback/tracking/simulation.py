@@ -14,10 +14,11 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.feedback.mount import PARAMETERS
 from rfpose.feedback.servo import PiLaw, Stepper
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
+from rfpose.feedback.servo.margins import Margins
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.hidden import Field, draw_field, generator
 from rfpose.feedback.tracking.instruments import LEARNED, Workshop
-from rfpose.feedback.tracking.loops import Margins, check_gains
+from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.timeline import Day, days
@@ -164,7 +165,7 @@ class Simulation:
         n = len(self.field)
         self.stored = np.unique(np.linspace(0, n - 1, min(plan.stored, n)).astype(np.int64))
         self._runs = [self._start(m) for m in self.methods]
-        self._gust_state = np.zeros((n, 3))
+        self._gust_state = self.gusts.process.start(generator(self.seed, 1, 0), n)
         self.done = 0
         self._check_reach()
 
@@ -322,7 +323,7 @@ class Simulation:
         day = self.days[segment.i_day]
         plan, n = self.scenario.tracking, len(self.field)
         if segment.first == 0:
-            self._gust_state[:] = self.gusts.begin(generator(self.seed, 1, segment.i_day), n)
+            self._gust_state[:] = self.gusts.process.start(generator(self.seed, 1, segment.i_day), n)
             for run in self._runs:
                 self._begin_day(run, segment.i_day)
         place = (segment.i_day, segment.first)

@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import ScenarioError
+from rfpose.feedback.energy import clear_beam_w_m2
 from rfpose.feedback.sun import Site, sun_position
 from rfpose.scenario import Scenario
 
-__all__ = ["Day", "beam_w_per_m2", "day_of", "days", "hour_of_day", "site_of"]
+__all__ = ["Day", "day_of", "days", "hour_of_day", "site_of"]
 
 _COARSE_S = 20.0
 _MARGIN_S = 120.0
@@ -70,18 +71,6 @@ def site_of(scenario: Scenario) -> Site:
     )
 
 
-def beam_w_per_m2(elevation_rad: npt.ArrayLike) -> FloatArray:
-    """Return the clear-sky beam [W/m²]; zero below the horizon.
-
-    References
-    ----------
-    .. [1] Edwards, Arrays of paraboloidal collectors, (3.8), (3.9).
-    """
-    sine = np.sin(np.asarray(elevation_rad, np.float64))
-    air = np.sqrt((755.6 * sine) ** 2 + 2.0 * 755.6 + 1.0) - 755.6 * sine
-    return np.asarray(np.where(sine > 0.0, np.maximum(1353.0 * (1.0 - 0.232 * air**0.427), 0.0), 0.0))
-
-
 def hour_of_day(unix_s: npt.ArrayLike, site: Site) -> FloatArray:
     """Return local mean solar time [h]."""
     return np.asarray(np.mod(np.asarray(unix_s) / 3600.0 + np.rad2deg(site.longitude_rad) / 15.0, 24.0))
@@ -133,6 +122,6 @@ def day_of(scenario: Scenario, date: datetime.date, since_first: int, *, whole: 
         since_first=since_first,
         unix_s=read_only(times[:n_step]),
         sun_enu=read_only(direction),
-        power_w_per_m2=read_only(beam_w_per_m2(elevation)),
+        power_w_per_m2=read_only(clear_beam_w_m2(elevation, site=site)),
         hour=read_only(hour_of_day(times[:n_step], site)),
     )

@@ -1,0 +1,82 @@
+"""Print how fast fields are tracked, how time and memory grow with the field, and what a plain loop would need.
+
+    python benchmarks/bench_tracking.py [--heliostats 10000] [--whole]
+
+One method (radio closed loop), 1 s servo steps, 4 s control interval, data/tracking_100m.toml. Without ``--whole`` the
+day is extrapolated from an hour of it; the first quarter of an hour, in which numba loads or compiles, is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numba
+
+from rfpose.feedback.tracking import Simulation, score
+from rfpose.scenario import load_scenario
+
+SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
+PLAIN = """
+import sys, time
+from rfpose.feedback.tracking import Simulation
+from rfpose.scenario import load_scenario
+base = load_scenario(sys.argv[1])
+tracking = base.tracking.model_copy(update={"first_hour": 9.0, "last_hour": 9.1})
+simulation = Simulation(base.model_copy(update={"tracking": tracking}), methods=("radio",), count=4, seed=1)
+start = time.perf_counter()
+simulation.advance()
+print((time.perf_counter() - start) / (4 * len(simulation.days[0].unix_s)))
+"""
+
+
+def track(n: int, n_segment: int | None) -> tuple[float, Simulation]:
+    """Seconds a mirror and step, and the simulation."""
+    simulation = Simulation(load_scenario(SCENARIO), methods=("radio",), count=n, seed=1)
+    simulation.advance()
+    last = simulation.n_segment if n_segment is None else min(1 + n_segment, simulation.n_segment)
+    steps = simulation.segments[last - 1].end - simulation.segments[0].end
+    start = time.perf_counter()
+    while simulation.done < last:
+        simulation.advance()
+    return (time.perf_counter() - start) / (n * steps), simulation
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--heliostats", type=int, default=10_000)
+    parser.add_argument("--whole", action="store_true", help="track the whole day, not an hour")
+    arguments = parser.parse_args()
+    print(f"{numba.get_num_threads()} threads")
+    print("mirrors   ns a mirror and second   day of 10.4 h   memory so far")
+    fastest = float("inf")
+    for n in (100, 1000, arguments.heliostats):
+        whole = arguments.whole and n == arguments.heliostats
+        each, simulation = track(n, None if whole else 4)
+        fastest = min(fastest, each)
+        day = each * n * len(simulation.days[0].unix_s)
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+        print(f"{n:7d} {1e9 * each:21.0f} {day:15.0f} s {'' if whole else '*':1} {memory:13.2f} GB")
+    print(
+        "* extrapolated"
+        if not arguments.whole
+        else f"rms {1e3 * score(simulation.sums('radio')).normal_rms_rad:.3f} mrad"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", PLAIN, str(SCENARIO)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    plain = float(done.stdout)
+    print(
+        f"the same code as plain Python: {1e6 * plain:.0f} µs a mirror and second, {plain / fastest:.0f} times as long"
+    )
+
+
+if __name__ == "__main__":
+    main()

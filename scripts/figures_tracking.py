@@ -1,0 +1,64 @@
+"""Draw the pictures of docs/tracking.md: `python scripts/figures_tracking.py [DIRECTORY]`.
+
+tracking_day.png    the methods over a day of the shipped scenario, and mirror by mirror
+tracking_outage.png what an hour and a half without radio does
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from rfpose.feedback.tracking import Simulation
+from rfpose.pipeline.track import track
+from rfpose.pipeline.track_pictures import draw_track
+from rfpose.scenario import load_scenario
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENARIO = ROOT / "data" / "tracking_100m.toml"
+OUTAGE = (10.5, 12.0)
+
+
+def draw_outage(path: Path) -> None:
+    """Draw the field's error through an outage."""
+    base = load_scenario(SCENARIO)
+    data = base.model_dump(exclude_none=True)
+    data["tracking"] |= {"first_hour": 9.5, "last_hour": 13.0}
+    data["tracking"]["radio"]["outages"] = ({"first_hour": OUTAGE[0], "last_hour": OUTAGE[1]},)
+    methods = ("camera-model", "radio", "radio-model", "radio-both")
+    simulation = Simulation(type(base).model_validate(data), methods=methods, seed=0)
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+    hour = simulation.days[0].hour[:: round(base.tracking.store_interval_s)]
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for name, colour in zip(methods, ("#D55E00", "#0072B2", "#56B4E9", "#009E73"), strict=True):
+        axes.plot(hour, 1e3 * simulation.curves(name).rms_rad, color=colour, lw=1.3, label=name)
+    axes.axvspan(*OUTAGE, color="0.85", label="no radio")
+    axes.set_xlabel("local mean solar time [h]")
+    axes.set_ylabel("normal error, rms over 12 mirrors [mrad]")
+    axes.set_ylim(0.0, None)
+    axes.set_xlim(float(np.min(hour)), float(np.max(hour)))
+    axes.grid(alpha=0.3)
+    axes.legend(ncols=5, fontsize=8, loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Draw both."""
+    directory = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
+    directory.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        found = track(SCENARIO, Path(temporary) / "day.h5")
+    draw_track(found, directory / "tracking_day.png")
+    draw_outage(directory / "tracking_outage.png")
+
+
+if __name__ == "__main__":
+    main()

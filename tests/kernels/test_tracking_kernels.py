@@ -1,0 +1,51 @@
+"""The tracking kernel compiled and as plain Python: the same courses."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# a dish and a heliostat by every kind of feedback, for six minutes
+COURSES = """
+import sys
+import numpy as np
+from rfpose.feedback.tracking import Simulation
+from rfpose.scenario import load_scenario
+base = load_scenario(sys.argv[1])
+found = {}
+for collector, methods in (("heliostat", ("open-loop", "encoder", "radio-both")), ("dish", ("sun-sensor", "radio"))):
+    data = base.model_dump(exclude_none=True)
+    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.1, "settle_s": 0.0, "collector": collector}
+    data["tracking"]["radio"]["outages"] = ({"first_hour": 9.07, "last_hour": 9.08},)
+    data["tracking"]["radio_model"]["points_per_day"] = 8
+    simulation = Simulation(type(base).model_validate(data), methods=methods, count=2, seed=4)
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+    for name, values in simulation.state().items():
+        found[f"{collector}/{name}"] = values
+np.savez(sys.argv[2], **found)
+"""
+
+
+def test_compiled_equals_plain_python(tmp_path):
+    results = []
+    for jit in ("0", "1"):
+        out = tmp_path / f"courses{jit}.npz"
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": jit}
+        subprocess.run(
+            [sys.executable, "-c", COURSES, str(ROOT / "data" / "tracking_100m.toml"), str(out)],
+            env=environment, check=True,
+        )  # fmt: skip
+        results.append(dict(np.load(out)))
+    compiled, plain = results
+    assert compiled.keys() == plain.keys()
+    for name, values in compiled.items():
+        if name.endswith(("histogram", "hours")):
+            # a rounding may move an error into the next bin
+            np.testing.assert_allclose(values.sum(), plain[name].sum(), rtol=1e-6, err_msg=name)
+        else:
+            np.testing.assert_allclose(values, plain[name], rtol=1e-6, atol=1e-9, err_msg=name)
