@@ -15,16 +15,20 @@ from click.testing import CliRunner, Result
 
 from rfpose import geometry
 from rfpose.cli._app import app
+from rfpose.feedback.calibration import fit
 from rfpose.feedback.camera.render import Beam, Target, View, render
 from rfpose.feedback.drone import Drone, fly
+from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect, target_offset_m
+from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.mount_file import read_models
 from rfpose.pipeline.result_file import read_result
 from rfpose.scenario import Scenario, load_scenario
 
+PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
 SITE = Site(latitude_rad=np.deg2rad(37.1), longitude_rad=np.deg2rad(-2.36), altitude_m=500.0)
 BOARD_ENU_M, BOARD_NORMAL = np.array([0.0, 0.0, 12.0]), np.array([0.0, 1.0, 0.0])
 PLANNED = Mount(pivot_enu_m=np.array([6.0, 36.0, 1.5]), actuators=(Actuator(counts_per_unit=5000.0),) * 2)
@@ -197,6 +201,22 @@ def test_radio_with_a_flight_gets_the_receivers_plane(where: Path, tmp_path: Pat
     assert abs(plane) == pytest.approx(0.05 * cosine, rel=0.15)
 
 
+@pytest.mark.skipif(not PAINT.is_dir(), reason=f"the PAINT records are not at {PAINT}")
+def test_real_records_and_a_flight_in_one_fit(tmp_path: Path) -> None:
+    data = read_heliostat(PAINT, "BF57")
+    fitted = fit(data.mount, Measurements.from_spots(data.count, sun_enu=data.sun_enu, spot_enu_m=data.spot_enu_m),
+                 free="level-7").mount  # fmt: skip
+    (made,) = fly([fitted], target_enu_m=[0.0, 0.0, 40.0], n_point=40, rng=np.random.default_rng(5))
+    names = ",".join(f"{what}_{axis}_m" for what in ("drone", "target") for axis in ("east", "north", "up"))
+    rows = [["BF57", *c, *r[:3], *r[4:7]] for c, r in zip(made.count.tolist(), made.row.tolist(), strict=True)]
+    _table(tmp_path / "flight.csv", f"heliostat,axis_1,axis_2,{names}", rows)
+    (found,) = _json(
+        "calibrate", PAINT, "--heliostat", "BF57", "--drone", tmp_path / "flight.csv", "--parameters", "level-7"
+    )["heliostats"]
+    assert found["sources"] == {"PAINT": 145, "drone": 40}
+    assert found["median_mrad"] < 0.7
+
+
 def test_commands_of_the_model_hit(where: Path, tmp_path: Path) -> None:
     model, table = where / "models.json", tmp_path / "day.csv"
     if not model.exists():
@@ -237,10 +257,10 @@ def test_a_person_reads_it_too(where: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["calibrate"], 2, "either a PAINT DIRECTORY"),
+        (["calibrate"], 2, "give a PAINT DIRECTORY"),
         (["calibrate", "--mount", "{w}/planned.toml"], 2, "needs measurements"),
         (["calibrate", "--mount", "{w}/planned.toml", "--radio", "{w}/result.h5"], 2, "belong together"),
-        (["calibrate", "{w}", "--drone", "{w}/flight.csv"], 2, "go with --mount"),
+        (["calibrate", "{w}/nowhere", "--drone", "{w}/flight.csv"], 3, "no such directory"),
         (["calibrate", "--mount", "{w}/motors.csv", "--drone", "{w}/flight.csv"], 3, "neither JSON nor TOML"),
         (["calibrate", "--mount", "{w}/site.toml", "--drone", "{w}/flight.csv"], 3, "no rfpose-mount file"),
         (["calibrate", "--mount", "{w}/planned.toml", "--drone", "{w}/motors.csv"], 3, "has no column drone_east_m"),

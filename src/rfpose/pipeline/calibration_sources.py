@@ -1,4 +1,4 @@
-"""Measurements of heliostats out of files: radio poses, pictures of a target, a drone's log.
+"""Measurements of heliostats out of files: radio poses, pictures of a target, a drone's log, PAINT records.
 
 Tables are CSV with a header; motor positions are ``axis_1`` and ``axis_2`` in the mount's counts, times ISO 8601 with
 their zone.
@@ -24,11 +24,13 @@ from rfpose.feedback.camera.spot import SpotStatus, read_picture
 from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount
+from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.multilat import PoseStatus
+from rfpose.pipeline.mount_file import MountFile, StoredMount
 from rfpose.pipeline.result_file import frame_time, read_result
 
-__all__ = ["Gathered", "read_camera", "read_drone", "read_radio"]
+__all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 
 BOARD_NAME, PICTURES_NAME = "board.toml", "pictures.csv"
 _SPOT_SIGMA_M = 0.01
@@ -41,7 +43,7 @@ class Gathered:
     Attributes
     ----------
     source
-        ``"radio"``, ``"camera"`` or ``"drone"``.
+        ``"radio"``, ``"camera"``, ``"drone"`` or ``"PAINT"``.
     measurements
         By heliostat's name.
     left_out
@@ -111,6 +113,34 @@ def _nearest(entries: Any, unix_s: float, within_s: float) -> Any:
         return None
     i = int(np.argmin(np.abs(entries[:, 0] - unix_s)))
     return entries[i] if abs(entries[i, 0] - unix_s) <= within_s else None
+
+
+def read_paint(directory: Path, names: Sequence[str]) -> tuple[Gathered, MountFile]:
+    """Take PAINT records to be fitted together with other sources, and the mounts as built.
+
+    Parameters
+    ----------
+    directory
+        With the heliostats' folders and the tower's.
+    names
+        Heliostats; empty: all.
+    """
+    made, mounts = {}, {}
+    left_out: dict[str, str] = {}
+    site = None
+    for name in names or heliostat_ids(directory):
+        data = read_heliostat(directory, name)
+        timed = np.isfinite(data.unix_s).all()
+        made[name] = Measurements.from_spots(
+            data.count,
+            sun_enu=data.sun_enu,
+            spot_enu_m=data.spot_enu_m,
+            unix_s=data.unix_s if timed else data.record_ids.astype(np.float64),
+        )
+        mounts[name] = StoredMount(mount=data.mount)
+        left_out |= {f"{name} record {number}": why for number, why in data.skipped.items()}
+        site = data.site
+    return Gathered(source="PAINT", measurements=made, left_out=left_out), MountFile(heliostats=mounts, site=site)
 
 
 def read_drone(path: Path, mounts: Mapping[str, Mount]) -> Gathered:
