@@ -183,7 +183,7 @@ def row_weights(weight, inverse, range2, visible, seen_all, w):
 def dop_sums(transmitter, weight, visible, point, first, n, sums):
     """Sums over transmitters of w (1, u, u uᵀ) for BLOCK points from ``first`` on, the last one repeated; (sum, point).
 
-    Points side by side, so that the inner loop vectorises in plain arithmetic.
+    Points side by side, so that their sums do not wait for each other.
     """
     seen_all = visible.shape[0] == 0
     sums[:] = 0.0
@@ -230,14 +230,14 @@ def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
             m[1, 1], m[1, 2], m[2, 2] = sums[7, k], sums[8, k], sums[9, k]
             centre(s, m)
             if invert(m, q):
-                out[first + k, 0] = q[0, 0]
-                out[first + k, 1] = q[1, 1]
-                out[first + k, 2] = q[2, 2]
+                out[0, first + k] = math.sqrt(q[0, 0] + q[1, 1] + q[2, 2])
+                out[1, first + k] = math.sqrt(q[0, 0] + q[1, 1])
+                out[2, first + k] = math.sqrt(q[2, 2])
 
 
 @kernel_parallel
 def dop_rows(transmitter, weight, visible, point, n_chunk, out):
-    """Variances east, north, up of each point per unit of one transmitter's range variance; (point, xyz)."""
+    """Dilution of position, plane and height of each point, (3, point), per unit of one transmitter's range sigma."""
     for chunk in numba.prange(n_chunk):
         begin, end = span(chunk, n_chunk, point.shape[0])
         dop_rows_part(begin, end, transmitter, weight, visible, point, out)

@@ -243,23 +243,18 @@ def dilution(
     # a copy: a read-only array would be another type to the kernels, compiled anew
     flat = np.array(point.reshape(-1, n_axis))
     if n_axis == 2:
-        variance = _planar(transmitter, flat, visible)
+        out = _planar(transmitter, flat, visible)
     else:
-        variance = np.full((len(flat), 3), np.nan)
+        out = np.full((3, len(flat)), np.nan)
         seen = _mask(visible, (len(flat), len(transmitter)), lead)
         _kernels.dop_rows(
-            np.ascontiguousarray(transmitter.T), np.ones(len(transmitter)), seen, flat, _chunks(len(flat)), variance
+            np.ascontiguousarray(transmitter.T), np.ones(len(transmitter)), seen, flat, _chunks(len(flat)), out
         )
-    root = np.sqrt(variance)
-    return Dilution(
-        position=np.sqrt(variance.sum(axis=1)).reshape(lead),
-        horizontal=np.hypot(root[:, 0], root[:, 1]).reshape(lead),
-        vertical=root[:, 2].reshape(lead),
-    )
+    return Dilution(position=out[0].reshape(lead), horizontal=out[1].reshape(lead), vertical=out[2].reshape(lead))
 
 
 def _planar(transmitter: FloatArray, point: FloatArray, visible: npt.ArrayLike | None) -> FloatArray:
-    """(point, xyz) variances in the plane, z zero."""
+    """(3, point) dilution in the plane: position, the same, and zero."""
     offset = point[:, None] - transmitter
     with np.errstate(invalid="ignore", divide="ignore"):
         u = offset / np.linalg.norm(offset, axis=2, keepdims=True)
@@ -268,7 +263,8 @@ def _planar(transmitter: FloatArray, point: FloatArray, visible: npt.ArrayLike |
         m = np.einsum("nt,ntx,nty->nxy", weight, u, u)
         det = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2
         det = np.where(det > 1e-12 * (m[:, 0, 0] + m[:, 1, 1]) ** 2, det, np.nan)
-        return np.stack([m[:, 1, 1] / det, m[:, 0, 0] / det, 0.0 * det], axis=1)
+        root = np.sqrt((m[:, 0, 0] + m[:, 1, 1]) / det)
+        return np.stack([root, root, 0.0 * root])
 
 
 def normal_map(
