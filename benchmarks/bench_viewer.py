@@ -68,8 +68,15 @@ def large_recording(folder: Path, gigabytes: float) -> Path:
     count = int(gigabytes * 1e9 / 4)
     name = site.receiver_ids[0]
     with h5py.File(path, "r+") as file:
-        iq = file[f"receivers/{name}/iq"]
-        iq.resize((count,))
+        first = file[f"receivers/{name}/iq"][()]
+        del file[f"receivers/{name}/iq"]
+        plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        plan.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        space = h5py.h5s.create_simple((count,))
+        kind = h5py.h5t.py_create(first.dtype)
+        iq = h5py.Dataset(h5py.h5d.create(file[f"receivers/{name}"].id, b"iq", kind, space, plan))
+        iq[: len(first)] = first
+        iq[count - 1 :] = first[:1]
         file[f"receivers/{name}/blocks"][0] = (0, count, 0)
     return path
 
@@ -83,9 +90,10 @@ def open_large(gigabytes: float) -> None:
         app, window = open_window(shipped_scenario("table2_100m.toml"))  # a viewer that is up and running
         view = window.views["recording"]
         with Peak() as peak:
-            start = time.perf_counter()
+            start, own = time.perf_counter(), time.process_time()
             window.open_path(path)
             seen: dict[str, float] = {}
+            first = float("nan")
             while len(seen) < 4 and time.perf_counter() - start < _GIVE_UP_S:
                 app.processEvents()
                 time.sleep(0.002)  # as the event loop of a real window does, which waits
@@ -93,6 +101,7 @@ def open_large(gigabytes: float) -> None:
                     if what not in seen and getattr(view, what, None) is not None:
                         view.grab()
                         seen[what] = time.perf_counter() - start
+                        first = time.process_time() - own if len(seen) == 1 else first
             settle(app, window)
         if window.session.message is not None:
             print(f"message: {window.session.message.text}")
@@ -104,6 +113,7 @@ def open_large(gigabytes: float) -> None:
             ("_summary", "levels of all receivers"),
         ):
             print(f"  {text}: {seen.get(what, float('nan')):.2f} s")
+        print(f"  processor time to the first picture: {first:.2f} s")
         print(f"  peak memory of the whole viewer: {peak.bytes / 1e6:.0f} MB")
         window.close()
 
@@ -129,8 +139,9 @@ def drag(n_heliostat: int, n_step: int) -> None:
         maps = worst = 0.0
         edit.begin_drag()
         start = last = time.perf_counter()
+        own = time.process_time()
         for k in range(n_step):
-            angle = 2.0 * np.pi * k / n_step
+            angle = 2.0 * np.pi * (k + 0.5) / n_step  # never where it stands already
             shown = view.map
             edit.move("T1", east=100.0 * np.cos(angle), north=100.0 * np.sin(angle))
             while view.map is shown:
@@ -141,7 +152,11 @@ def drag(n_heliostat: int, n_step: int) -> None:
             worst, last, maps = max(worst, now - last), now, maps + 1
         edit.end_drag()
         rate = maps / (last - start)
-        print(f"drag, {n_heliostat} mirrors, {estimator}: {rate:.1f} pictures/s, longest {1e3 * worst:.0f} ms")
+        own = 1e3 * (time.process_time() - own) / n_step
+        print(
+            f"drag, {n_heliostat} mirrors, {estimator}: {rate:.1f} pictures/s, longest {1e3 * worst:.0f} ms, "
+            f"processor time {own:.0f} ms a picture"
+        )
     window.close()
 
 

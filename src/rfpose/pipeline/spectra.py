@@ -31,6 +31,7 @@ __all__ = [
     "losses",
     "phase_track",
     "phases_of",
+    "prepare",
     "spectrum",
     "viewing_frames",
     "waterfall",
@@ -214,6 +215,11 @@ class SharedRecording(Recording):
     def _refuse_closed(self) -> None:
         if self._closed:
             raise RecordingError(f"{self.path}: was closed; open it again")
+
+
+def prepare() -> None:
+    """Load what the first spectrum needs, so that it does not wait for it."""
+    import scipy.signal  # noqa: F401
 
 
 def viewing_frames(recording: Recording, scenario: Scenario | None) -> tuple[npt.NDArray[np.int64], int]:

@@ -11,7 +11,7 @@ import pyqtgraph as pg
 from PySide6.QtGui import QColor, QFont, QFontDatabase, QPalette
 from PySide6.QtWidgets import QApplication
 
-__all__ = ["SERIES", "STATUS_COLOURS", "Theme", "apply", "colour_table", "ensure_font", "theme_of"]
+__all__ = ["SERIES", "STATUS_COLOURS", "Theme", "apply", "colour_table", "ensure_font", "see_through", "theme_of"]
 
 # Okabe and Ito's palette; yellow is left out, it cannot be seen on white
 SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6BB1", "#7F7F7F", "#A6761D", "#66A61E")
@@ -33,6 +33,14 @@ class Theme:
     accent: str
     warning: str
     trace: str
+    blue: str
+
+
+def see_through(colour: str) -> QColor:
+    """Return a colour that what lies behind still shines through."""
+    found = QColor(colour)
+    found.setAlpha(190)
+    return found
 
 
 _LIGHT = Theme(
@@ -46,6 +54,7 @@ _LIGHT = Theme(
     accent="#0b62a8",
     warning="#a83c00",
     trace="#3c444d",
+    blue="#0072B2",
 )
 _DARK = Theme(
     name="dark",
@@ -58,6 +67,7 @@ _DARK = Theme(
     accent="#4aa3e0",
     warning="#ff9a57",
     trace="#b9c2cc",
+    blue="#56B4E9",
 )
 
 

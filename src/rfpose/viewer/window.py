@@ -27,6 +27,7 @@ from PySide6.QtWidgets import (
 
 from rfpose import __version__
 from rfpose.pipeline.demo import shipped_scenario
+from rfpose.pipeline.spectra import prepare
 from rfpose.viewer.preferences import Preferences
 from rfpose.viewer.state.document import Document, open_document
 from rfpose.viewer.state.session import Session
@@ -96,6 +97,7 @@ class MainWindow(QMainWindow):
         self._build_menu()
         self._build_pages()
         self.workers.changed.connect(self._busy_timer.start)
+        self.workers.run("Getting ready", lambda _: prepare(), lambda _: None)
 
     # -- building ----------------------------------------------------------------------------------------
 
@@ -411,7 +413,7 @@ class MainWindow(QMainWindow):
         self.message_label.setText(html.escape(message.text))
 
     def _show_busy(self) -> None:
-        jobs = [job for job in self.workers.jobs if job.name != "Map"]
+        jobs = [job for job in self.workers.jobs if job.name not in ("Map", "Getting ready")]
         for widget in (self.busy_label, self.busy_bar, self.busy_cancel):
             widget.setVisible(bool(jobs))
         if jobs:

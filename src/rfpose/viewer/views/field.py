@@ -24,7 +24,7 @@ from rfpose.checks import FloatArray
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.field_view import FieldPicture, History, history
 from rfpose.viewer.state.session import Selection, Session
-from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme
+from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme, see_through
 from rfpose.viewer.views.parts import Plan, Scale, Table, View, plot_in, segments
 from rfpose.viewer.views.space import Space
 from rfpose.viewer.workers import Workers
@@ -118,13 +118,15 @@ class FieldView(View):
         self.headline.setWordWrap(True)
         graphs = pg.GraphicsLayoutWidget()
         self.offset_plot = plot_in(graphs, theme, x="time [s]", y=None)
-        self.offset_plot.addLegend(offset=(-4, 4), labelTextSize="8pt", colCount=2)
+        self.offset_plot.addLegend(
+            offset=(-4, 2), labelTextSize="8pt", colCount=2, brush=pg.mkBrush(see_through(theme.plot))
+        )
         self.offset_curves = [
             self.offset_plot.plot(
                 [], [], pen=pg.mkPen(colour, width=1.5), symbol="o", symbolSize=5, symbolBrush=colour, symbolPen=None,
                 name=text,
             )
-            for colour, text in ((SERIES[0], "across (x)"), (SERIES[1], "up (y)"))
+            for colour, text in ((theme.blue, "across (x)"), (SERIES[1], "up (y)"))
         ]  # fmt: skip
         self.band = [
             self.offset_plot.plot([], [], pen=pg.mkPen(theme.muted, width=1, style=Qt.PenStyle.DashLine))
@@ -141,12 +143,12 @@ class FieldView(View):
         self.ellipse_plot.setAspectLocked(True)
         self.ellipses = pg.PlotCurveItem(pen=pg.mkPen(theme.muted, width=1), connect="finite")
         self.ellipse_now = pg.PlotCurveItem(pen=pg.mkPen(SERIES[1], width=2))
-        self.ellipse_dots = pg.ScatterPlotItem(size=6, pen=None, brush=SERIES[0])
+        self.ellipse_dots = pg.ScatterPlotItem(size=6, pen=None, brush=theme.blue)
         for item in (self.ellipses, self.ellipse_now, self.ellipse_dots):
             self.ellipse_plot.addItem(item)
         residual = pg.GraphicsLayoutWidget()
         self.residual_plot = plot_in(residual, theme, x="transmitter", y="residual [mm]")
-        self.residual_bars = pg.BarGraphItem(x=[0.0], height=[0.0], width=0.6, brush=SERIES[0], pen=None)
+        self.residual_bars = pg.BarGraphItem(x=[0.0], height=[0.0], width=0.6, brush=theme.blue, pen=None)
         self.residual_sigma = pg.ErrorBarItem(
             x=np.empty(0), y=np.empty(0), height=np.empty(0), beam=0.3, pen=pg.mkPen(theme.trace, width=1.5)
         )

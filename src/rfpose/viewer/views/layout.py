@@ -46,7 +46,7 @@ from rfpose.pipeline.live_layout import (
 )
 from rfpose.viewer.state.layout_edit import LayoutEdit
 from rfpose.viewer.state.session import Session
-from rfpose.viewer.theme import Theme
+from rfpose.viewer.theme import Theme, see_through
 from rfpose.viewer.views.parts import Dots, Scale, View, plot_in
 from rfpose.viewer.workers import Workers
 
@@ -305,10 +305,8 @@ class LayoutView(View):
             box.setChecked(not choice.tones or k in choice.tones)
             box.toggled.connect(lambda _: self._tones_ticked())
             self.tones.addWidget(box)
-        self.estimator.setCurrentText(choice.estimator)
-        self.posture.setCurrentIndex(self.posture.findData(choice.posture))
-        self.sun_azimuth.setValue(choice.sun.azimuth_deg)
-        self.sun_elevation.setValue(choice.sun.elevation_deg)
+        self._show_choice()
+        self._filling = True
         site = edit.scenario.site
         placed = site.latitude_deg is not None and site.longitude_deg is not None
         self.moment.setEnabled(placed)
@@ -316,6 +314,17 @@ class LayoutView(View):
             "Puts the sun where it stands over the site at this time" if placed
             else "The scenario has no [site] latitude_deg and longitude_deg: set the sun by hand"
         )  # fmt: skip
+        self._filling = False
+
+    def _show_choice(self) -> None:
+        """Bring the controls to what is chosen, whoever chose it."""
+        if self._edit is None:
+            return
+        choice, self._filling = self._edit.choice, True
+        self.estimator.setCurrentText(choice.estimator)
+        self.posture.setCurrentIndex(self.posture.findData(choice.posture))
+        self.sun_azimuth.setValue(choice.sun.azimuth_deg)
+        self.sun_elevation.setValue(max(choice.sun.elevation_deg, self.sun_elevation.minimum()))
         self._filling = False
 
     def _show_all(self) -> None:
@@ -339,6 +348,7 @@ class LayoutView(View):
             return
         scenario, choice, pivot = edit.scenario, edit.choice, edit.pivot_enu_m
         self._limits = None
+        self._show_choice()
         self.workers.run("Field", lambda _: LiveLayout(scenario, choice, pivot_enu_m=pivot), self._prepared)
 
     def _prepared(self, engine: LiveLayout) -> None:
@@ -436,7 +446,7 @@ class LayoutView(View):
             if name not in self._handles:
                 handle = pg.TargetItem(
                     size=15, symbol="t1", pen=pg.mkPen(self.theme.text, width=1.5), brush="#D55E00",
-                    hoverBrush="#E69F00", label=name, labelOpts={"color": self.theme.text, "offset": (8, 8)},
+                    hoverBrush="#E69F00", label=name, labelOpts={"color": self.theme.text, "offset": (8, 8), "fill": see_through(self.theme.plot)},
                 )  # fmt: skip
                 handle.sigPositionChanged.connect(lambda item, name=name: self._dragged(name, item))
                 handle.sigPositionChangeFinished.connect(lambda _: self._drag_ended())
@@ -617,11 +627,6 @@ class LayoutView(View):
     def _sun_found(self, sun: SunPlace) -> None:
         if self._edit is None:
             return
-        self._filling = True
-        self.sun_azimuth.setValue(sun.azimuth_deg)
-        self.sun_elevation.setValue(max(sun.elevation_deg, self.sun_elevation.minimum()))
-        self.posture.setCurrentIndex(self.posture.findData("sun"))
-        self._filling = False
         self._edit.choose(sun=sun, posture="sun")
 
     def _costs_typed(self) -> None:

@@ -23,7 +23,7 @@ from rfpose.checks import FloatArray
 from rfpose.pipeline.field_view import FieldPicture
 from rfpose.viewer.state.observed import Event
 from rfpose.viewer.state.session import Session
-from rfpose.viewer.theme import Theme, colour_table
+from rfpose.viewer.theme import Theme, colour_table, see_through
 from rfpose.viewer.workers import Workers
 
 __all__ = ["Dots", "Plan", "Scale", "Table", "View", "plot_in", "segments"]
@@ -245,7 +245,7 @@ class Plan:
         )
 
     def _label(self, name: str, place: FloatArray, colour: str) -> None:
-        label = pg.TextItem(name, color=colour, anchor=(-0.15, 1.05))
+        label = pg.TextItem(name, color=colour, anchor=(-0.15, 1.05), fill=see_through(self.theme.plot))
         label.setZValue(20)
         label.setPos(float(place[0]), float(place[1]))
         self.plot.addItem(label, ignoreBounds=True)

@@ -60,6 +60,7 @@ class RecordingView(View):
         self.look: FrameLook | None = None
         self.track: PhaseTrack | None = None
         self._summary: dict[str, Any] | None = None
+        self._rest_waits = False
         self._marks: list[Any] = []
         self._refine = QTimer(self, singleShot=True, interval=_REDRAW_MS)
         self._refine.timeout.connect(self._refine_waterfall)
@@ -140,7 +141,7 @@ class RecordingView(View):
         self.spectrum_plot = plot_in(self.graphs, theme, x="frequency from the centre [MHz]", y="power [dBFS]", row=0)
         self.spectrum_curve = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1), antialias=False)
         self.spectrum_plot.addItem(self.spectrum_curve)
-        self.carriers = pg.ScatterPlotItem(symbol="t", size=11, pen=None, brush=SERIES[0])
+        self.carriers = pg.ScatterPlotItem(symbol="t", size=11, pen=None, brush=theme.blue)
         self.sidebands = pg.ScatterPlotItem(symbol="o", size=6, pen=None, brush=SERIES[1])
         for item, text in ((self.carriers, "carrier"), (self.sidebands, "sideband")):
             self.spectrum_plot.addItem(item)
@@ -161,8 +162,10 @@ class RecordingView(View):
         self.phase_plot.setLabel("left", "phase − mean", units="rad")
         self.phase_plot.getAxis("left").enableAutoSIPrefix(True)
         self.phase_bars = pg.ErrorBarItem(x=np.empty(0), y=np.empty(0), height=np.empty(0), beam=0.0)
-        self.phase_curve = pg.PlotDataItem(pen=pg.mkPen(SERIES[0], width=1.5), symbol="o", symbolSize=6, symbolPen=None)
-        self.phase_curve.setSymbolBrush(SERIES[0])
+        self.phase_curve = pg.PlotDataItem(
+            pen=pg.mkPen(theme.blue, width=1.5), symbol="o", symbolSize=6, symbolPen=None
+        )
+        self.phase_curve.setSymbolBrush(theme.blue)
         self.phase_plot.addItem(self.phase_bars)
         self.phase_plot.addItem(self.phase_curve)
         self.gaps = pg.PlotCurveItem(pen=pg.mkPen(theme.muted, width=6), connect="pairs")
@@ -178,7 +181,7 @@ class RecordingView(View):
         self.circle_plot.setAspectLocked(True)
         turn = np.linspace(0.0, 2.0 * np.pi, 181)
         self.circle_plot.addItem(pg.PlotCurveItem(np.cos(turn), np.sin(turn), pen=pg.mkPen(theme.grid, width=1)))
-        self.circle = pg.ScatterPlotItem(size=4, pen=None, brush=pg.mkBrush(SERIES[0]))
+        self.circle = pg.ScatterPlotItem(size=4, pen=None, brush=pg.mkBrush(theme.blue))
         self.circle_plot.addItem(self.circle)
 
     # -- what happens ------------------------------------------------------------------------------------
@@ -202,16 +205,28 @@ class RecordingView(View):
         self._draw_track()
         if document is None or not self.applies():
             return
+        self._rest_waits = document.recording is not None
         if document.recording is not None:
             starts = document.frame_start_index
             rate_hz = float(document.recording.sample_rate)
             self.spectrum_plot.setXRange(-0.5e-6 * rate_hz, 0.5e-6 * rate_hz, padding=0.01)
             self.waterfall_plot.setYRange(0.0, float(len(starts)), padding=0.0)
-            self._refine.start()
-            self._load_levels(document)
-        self._load_frame()
-        self._load_receiver()
+            self._refine.stop()
+            self._load_spectrum()
+        else:
+            self._load_receiver()
         self._mark_selection()
+
+    def _load_rest(self) -> None:
+        """After the first picture of a recording: everything that takes longer."""
+        document = self.session.document
+        if not self._rest_waits or document is None or document.recording is None:
+            return
+        self._rest_waits = False
+        self._refine.start()
+        self._load_look()
+        self._load_receiver()
+        self._load_levels(document)
 
     def _fill_controls(self, document: Document | None) -> None:
         scenario = None if document is None else document.scenario
@@ -243,7 +258,8 @@ class RecordingView(View):
             self._load_receiver()
             self._refine.start()
         if now.receiver != before.receiver or now.frame != before.frame:
-            self._load_frame()
+            self._load_spectrum()
+            self._load_look()
         if (now.transmitter, now.reference, now.tone) != (before.transmitter, before.reference, before.tone):
             self._draw_look()
             self._draw_track()
@@ -294,21 +310,35 @@ class RecordingView(View):
 
     # -- work --------------------------------------------------------------------------------------------
 
-    def _load_frame(self) -> None:
-        document, now = self.session.document, self.session.selection
-        if document is None or document.recording is None or now.receiver is None:
-            return
-        recording, scenario, receiver = document.recording, document.scenario, now.receiver
+    def _frame_start(self) -> int | None:
+        """First sample of the frame that is looked at; None where there is none."""
+        document = self.session.document
+        if document is None or document.recording is None or not len(document.frame_start_index):
+            return None
         starts = document.frame_start_index
-        if not len(starts):
-            return
-        start, count = int(starts[min(now.frame, len(starts) - 1)]), document.frame_samples
+        return int(starts[min(self.session.selection.frame, len(starts) - 1)])
 
+    def _load_spectrum(self) -> None:
+        document, receiver, start = self.session.document, self.session.selection.receiver, self._frame_start()
+        if document is None or document.recording is None or receiver is None or start is None:
+            return
+        recording, scenario, count = document.recording, document.scenario, document.frame_samples
         self.workers.run(
             "Spectrum",
             lambda _: spectrum(recording, receiver, start, count, scenario=scenario),
             self._show_spectrum,
+            failed=self._spectrum_failed,
         )
+
+    def _spectrum_failed(self, text: str) -> None:
+        self.session.tell(text, is_error=True)
+        self._load_rest()
+
+    def _load_look(self) -> None:
+        document, receiver, start = self.session.document, self.session.selection.receiver, self._frame_start()
+        if document is None or document.recording is None or receiver is None or start is None:
+            return
+        recording, scenario = document.recording, document.scenario
         if scenario is not None and receiver in scenario.receiver_ids:
             self.workers.run(
                 "Demodulating", lambda _: look_at_frame(recording, scenario, receiver, start), self._show_look
@@ -379,6 +409,7 @@ class RecordingView(View):
     def _show_spectrum(self, found: Spectrum | None) -> None:
         self.spectrum = found
         self._draw_spectrum()
+        self._load_rest()
 
     def _draw_spectrum(self) -> None:
         for mark in self._marks:
@@ -393,7 +424,7 @@ class RecordingView(View):
             return
         key = "&nbsp;&nbsp;".join(
             f'<span style="color:{colour}">{text}</span>'
-            for colour, text in ((SERIES[0], "▼ carrier"), (SERIES[1], "● sideband"))
+            for colour, text in ((self.theme.blue, "▼ carrier"), (SERIES[1], "● sideband"))
         )
         self.spectrum_plot.setTitle(key if found.line_hz.size else None, size="9pt", color=self.theme.muted)
         self.spectrum_plot.setLabel("left", "power [dBFS]" if found.full_scale else "power [dB of one count²]")
@@ -510,7 +541,7 @@ class RecordingView(View):
             y=phase[known],
             height=2.0 * np.nan_to_num(sigma[known]),
             beam=0.0,
-            pen=pg.mkPen(SERIES[0], width=1),
+            pen=pg.mkPen(self.theme.blue, width=1),
         )
         how = "calibrated" if corrected else "as received"
         lost = f", {int((~known).sum())} of {len(phase)} frames not measured" if not known.all() else ""
