@@ -13,7 +13,16 @@ from scipy.stats import chi2, kstest
 
 from rfpose import geometry
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.multilat.ground import GroundStatus, Reflector, Surface, fresnel_coefficient, solve_with_ground
+from rfpose.multilat.ground import (
+    GroundStatus,
+    Reflector,
+    Surface,
+    fresnel_coefficient,
+    ground_bound,
+    guard_with_ground,
+    solve_with_ground,
+)
+from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
 from rfpose.multilat.rigid.integers import Observation
 from sites import TABLE_2
@@ -306,3 +315,53 @@ def test_callers_mistakes_are_refused_in_words():
     short = replace(field.observations[1], range_m=field.observations[1].range_m[:, :2])
     with pytest.raises(InvalidInputError, match="observation 1 must have shape"):
         field.solve([field.observations[0], short])
+
+
+def test_a_bad_transmitter_is_left_out_where_the_ground_reflects():
+    field = make_field(31, 24, 100e6, -0.3 + 0.1j)
+    rng = np.random.default_rng(5)
+    wrong = np.arange(6)
+    observations = []
+    for observation in field.observations:
+        ranges = observation.range_m.copy()
+        ranges[wrong, :, 4] += 60.0 * np.median(observation.sigma_m) * rng.uniform(1.0, 2.0, (6, 3)) * [1.0, -1.0, 0.5]
+        observations.append(replace(observation, range_m=ranges))
+    solution = field.solve(observations)
+    # tests need a coefficient that the wrong ones did not bend: they count for little, being far from the rest
+    guard = guard_with_ground(solution, false_alarm=1e-3)
+    left_out = guard.transmitter_status > TransmitterStatus.NOT_RECEIVED
+    assert left_out[wrong, 4].all()
+    left_out[wrong, 4] = False
+    assert not left_out.any()
+    assert np.all(guard.status[wrong] == IntegrityStatus.EXCLUDED)
+    assert np.all(guard.transmitter_status[wrong, 4] == TransmitterStatus.MULTIPATH)
+    error = geometry.angle_between_rad(guard.poses.normal_enu, field.rot_true[:, :, 2])
+    assert np.all(error < guard.protection_level_rad)
+    assert np.all(error < 5.0 * guard.poses.tilt_sigma_rad)
+    assert np.all(np.isfinite(guard.protection_level_rad))
+    with pytest.raises(InvalidInputError, match="false_alarm"):
+        guard_with_ground(solution, false_alarm=0.0)
+
+
+@pytest.mark.parametrize("calibration", [None, np.array([[15.0, -20.0, 2.5], [-40.0, 30.0, 3.0]])])
+def test_the_bound_with_estimated_coefficients_is_the_solutions_covariance(calibration):
+    field = make_field(32, 20, 100e6, -0.3 + 0.1j, calibration=calibration)
+    solution = field.solve(**({} if calibration is None else {"calibration_enu_m": calibration}))
+    assert np.all(solution.status == GroundStatus.OK)
+    cov = ground_bound(
+        TRANSMITTER,
+        PLACES,
+        field.pivot_true,
+        field.rot_true,
+        sigma_m=np.stack([o.sigma_m for o in field.observations], axis=1),
+        transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in field.observations], axis=1),
+        clock_class=[o.clock_class for o in field.observations],
+        carrier_rf_hz=field.carrier_rf_hz,
+        tone_hz=TONE_HZ,
+        reflectors=[Reflector()],
+        coefficient=[-0.3 + 0.1j],
+        calibration_enu_m=calibration,
+        knowledge=field.knowledge,
+    )
+    stated = tilt_sigma_rad(solution.full_cov[:, :6, :6], field.rot_true[:, :, 2])
+    np.testing.assert_allclose(stated, tilt_sigma_rad(cov[:, :6, :6], field.rot_true[:, :, 2]), rtol=0.02)

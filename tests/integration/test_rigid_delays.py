@@ -96,6 +96,29 @@ def test_a_jump_is_noticed_and_learned_anew():
     assert rms(out["error"][55:]) < 1.6 * rms(out["one"][55:])
 
 
+def test_a_clock_that_nothing_told_of_keeps_what_is_known():
+    """Two classes: the second is seen in frames 0, 1 and 3; in frame 2 its numbers are placeholders."""
+    n_frame, n_unknown = 4, 6 + 6
+    rot = np.broadcast_to(np.eye(3), (n_frame, 1, 3, 3))
+    clock = np.zeros((n_frame, 1, 2, 3))
+    clock[:, 0, 0] = [0.0, 0.1, 0.2]
+    clock[:, 0, 1] = [0.0, 0.3, -0.1]
+    clock[2, 0, 1] = 77.0 * np.arange(3)
+    cov = np.broadcast_to(1e-6 * np.eye(n_unknown), (n_frame, 1, n_unknown, n_unknown))
+    observed = np.ones(clock.shape, bool)
+    observed[2, 0, 1] = False
+    settings = {"time_s": np.arange(4.0), "drift_m_per_sqrt_s": 1e-5, "observed": observed}
+    learned = learn_delays(np.zeros((n_frame, 1, 3)), rot, clock, cov, **settings)
+    assert not learned.jumped.any()
+    np.testing.assert_allclose(learned.difference_m[:, 0], [[0.1, 0.2, 0.3, -0.1]] * n_frame, atol=1e-9)
+    sigma = np.sqrt(np.einsum("fmdd->fmd", learned.difference_cov_m2)[:, 0])
+    assert np.all(sigma[2, :2] < sigma[1, :2])
+    assert np.all(sigma[2, 2:] >= sigma[1, 2:])
+    assert np.all(sigma[3, 2:] < sigma[1, 2:])
+    with pytest.raises(InvalidInputError, match="observed"):
+        learn_delays(np.zeros((n_frame, 1, 3)), rot, clock, cov, **{**settings, "observed": observed[:2]})
+
+
 def test_bad_arguments():
     zero = np.zeros((2, 1, 1, 3))
     common = {"time_s": [0.0, 0.0], "drift_m_per_sqrt_s": 1.0}

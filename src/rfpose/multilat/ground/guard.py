@@ -204,10 +204,12 @@ class _Guard:
             every = np.where(mirrors.weight[rows] > 0.0, mirrors.weight[rows] ** -0.5, np.nan)
         free = np.equal(mirrors.bias_info[rows][..., i : i + 1], 0.0)
         middle = np.nanmedian(np.where(np.isfinite(left), left, 0.0), axis=2, keepdims=True)
-        relative = np.abs(np.where(free, left - middle, left)) / sigma
+        # without calibration nothing that all receivers have in common is an error
+        error = np.where(free, left - middle, left)
+        relative = np.abs(error) / sigma
         clear = np.any(np.nan_to_num(relative) > _CLEAR, axis=1)
-        size = np.nanmax(np.abs(np.nan_to_num(left)), axis=(1, 2))
-        apart = np.nanmax(np.abs(np.nan_to_num(left - middle)), axis=(1, 2))
+        size = np.abs(np.nan_to_num(error)).max(axis=(1, 2))
+        apart = np.abs(np.nan_to_num(left - middle)).max(axis=(1, 2))
         cause = np.where(
             clear.sum(axis=1) == 1,
             TransmitterStatus.ONE_RECEIVER,
