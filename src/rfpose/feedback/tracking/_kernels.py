@@ -217,6 +217,7 @@ def _track(
             reached = True
             if first:
                 reached = _command(model, k, known, row, sun[s], counts, work)
+                _nearest_turn(state[NEXT], k, counts)
                 state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
             reached = _command(model, k, known, row, sun[s + loop.interval], counts, work) and reached
@@ -250,7 +251,7 @@ def _track(
                 for a in range(2):
                     busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > drive_1.speed
                 if loop.feedback == ENCODER:
-                    for a in range(2):
+                    for a in range(2 if not busy else 0):
                         state[SLIP + a] += seconds * law.gain * entry[1 + a]
                 elif not busy:  # a motor that runs flat out is on its way: nothing winds up meanwhile
                     for i in range(3):

@@ -12,7 +12,7 @@ from rfpose.errors import ScenarioError
 from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, check_names
 from rfpose.scenario import Scenario
 
-__all__ = ["Field", "draw_field", "field_positions", "generator"]
+__all__ = ["Field", "azimuth_course_rad", "draw_field", "field_positions", "generator"]
 
 _INDEX = {name: i for i, name in enumerate(PARAMETERS)}
 _MONTH_DAYS = 30.4375
@@ -113,7 +113,7 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: Flo
     is_dish = plan.collector == "dish"
     if scenario.site.aim_enu_m is None and not is_dish:
         raise ScenarioError("[site] `aim_enu_m` is missing: the mirrors have nothing to face; add it")
-    nominal, constant = _nominal(scenario, ids, pivot, _home_rad(scenario, pivot, sun_enu))
+    nominal, constant = _nominal(scenario, ids, pivot, azimuth_course_rad(scenario, pivot, sun_enu)[1])
     true = _true(scenario, nominal, rng)
     lean = 1e-3 * rng.standard_normal((n, 2))
     e = plan.mount_errors
@@ -140,18 +140,22 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: Flo
     )
 
 
-def _home_rad(scenario: Scenario, pivot: FloatArray, sun_enu: FloatArray) -> FloatArray:
-    """Azimuth in the middle of each mirror's travel on that day."""
+def azimuth_course_rad(scenario: Scenario, pivot: FloatArray, sun_enu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the azimuth at which each mirror begins a course of the sun, and the middle of its travel [rad].
+
+    Followed without a jump, so that a course across north or past the zenith has one middle.
+    """
     low, high = np.full(len(pivot), np.inf), np.full(len(pivot), -np.inf)
-    azimuth = np.zeros(len(pivot))
+    azimuth = first = np.zeros(len(pivot))
     for i, sun in enumerate(sun_enu):
         normal = np.broadcast_to(sun, pivot.shape)
         if scenario.tracking.collector == "heliostat":
             normal = geometry.bisector_enu(np.asarray(scenario.site.aim_enu_m) - pivot, normal)
         found = geometry.azimuth_elevation_from_enu(normal)[0]
         azimuth = found if i == 0 else azimuth + np.mod(found - azimuth + np.pi, 2.0 * np.pi) - np.pi
+        first = azimuth if i == 0 else first
         low, high = np.minimum(low, azimuth), np.maximum(high, azimuth)
-    return np.asarray(0.5 * (low + high))
+    return np.asarray(first), np.asarray(0.5 * (low + high))
 
 
 def _nominal(

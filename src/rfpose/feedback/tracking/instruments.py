@@ -51,6 +51,7 @@ _PRIORS = {
 _WORMS = ("worm_1_sin_rad", "worm_1_cos_rad", "worm_2_sin_rad", "worm_2_cos_rad")
 _LARGE = (0.0, 0.03)
 _STEEP = 0.3
+_TURNS = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +63,16 @@ class _Look:
     centre_enu_m: FloatArray
     sun_enu: FloatArray
     """(look, xyz)"""
+
+    def at_turns(self, turn_of: npt.NDArray[np.int64]) -> _Look:
+        """Return one look a mirror; its sun is no longer the same for all and left out."""
+        row = np.arange(len(turn_of))
+        return _Look(
+            count=self.count[row, turn_of][:, None],
+            normal_enu=self.normal_enu[row, turn_of][:, None],
+            centre_enu_m=self.centre_enu_m[row, turn_of][:, None],
+            sun_enu=np.empty((0, 3)),
+        )
 
     def axes(self) -> tuple[FloatArray, FloatArray]:
         """Return the mirrors' right and up."""
@@ -127,12 +138,10 @@ class Workshop:
         cycles = np.floor((day.since_first - 1 + half) / interval_days)
         return int(np.floor(cycles * interval_days - half))
 
-    def _times(self, since_first: int, n: int, *, scatter: np.random.Generator | None = None) -> FloatArray:
-        """Instants of a day's sunshine: evenly spread, or drawn."""
+    def _times(self, since_first: int, n: int) -> FloatArray:
+        """Instants evenly spread over a day's sunshine."""
         date = self._scenario.tracking.date + datetime.timedelta(days=since_first)
         unix_s = day_of(self._scenario, date, since_first, whole=True).unix_s
-        if scatter is not None:
-            return np.sort(scatter.uniform(unix_s[0], unix_s[-1], n))
         return np.linspace(unix_s[0], unix_s[-1], n + 2)[1:-1]
 
     # -- looking -------------------------------------------------------------------------------------------
@@ -290,13 +299,16 @@ class Workshop:
         """Take off both axes what a camera sees the spot to be off, once a mirror, in whole motor steps."""
         rng = generator(self._seed, 24, since_first + 100_000, corrections)
         target = self._camera_target()
-        when = self._times(since_first, 1, scatter=rng)
+        when = self._times(since_first, _TURNS)
+        # mirrors take turns at the target, each at its own time of the day
+        turn_of = rng.integers(_TURNS, size=len(self._field))
+        when_sun = sun_position(when, self._site).direction_enu
         p = start.copy()
         per_rad = self._field.constant[:, 13:15] / self._scenario.tracking.drive.microsteps
         for _ in range(corrections):
-            look = self._look(p, when, since_first, rng, target)
+            look = self._look(p, when, since_first, rng, target).at_turns(turn_of)
             error, _ = self._camera_errors(look, target, rng)
-            wanted = geometry.bisector_enu(target - look.centre_enu_m[:, 0], look.sun_enu[0])
+            wanted = geometry.bisector_enu(target - look.centre_enu_m[:, 0], when_sun[turn_of])
             right, up = look.axes()
             off = wanted - look.normal_enu[:, 0]
             right_off = np.sum(off * right[:, 0], axis=1) - error[:, 0, 0]

@@ -16,7 +16,7 @@ from rfpose.feedback.servo import PiLaw, Stepper
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
 from rfpose.feedback.servo.margins import Margins
 from rfpose.feedback.tracking import _kernels
-from rfpose.feedback.tracking.hidden import Field, draw_field, generator
+from rfpose.feedback.tracking.hidden import Field, azimuth_course_rad, draw_field, generator
 from rfpose.feedback.tracking.instruments import LEARNED, Workshop
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import Method, choose
@@ -324,8 +324,10 @@ class Simulation:
         plan, n = self.scenario.tracking, len(self.field)
         if segment.first == 0:
             self._gust_state[:] = self.gusts.process.start(generator(self.seed, 1, segment.i_day), n)
+            begin = self._first_count(day)
             for run in self._runs:
                 self._begin_day(run, segment.i_day)
+                run.state[:, _kernels.NEXT] = begin
         place = (segment.i_day, segment.first)
         n_step = segment.end - segment.first
         control = round(plan.control_interval_s / plan.servo_interval_s)
@@ -366,6 +368,14 @@ class Simulation:
             run.trace[:, at] = trace
             run.stored_error[at] = error[self.stored].T
         self.done += 1
+
+    def _first_count(self, day: Day) -> FloatArray:
+        """Return about where azimuth motors begin a day, on the turn that leaves its course nearest to the middle."""
+        course = day.sun_enu[:: max(1, round(60.0 / self.scenario.tracking.servo_interval_s))]
+        first, middle = azimuth_course_rad(self.scenario, self.field.pivot_enu_m, course)
+        home, per_rad = self.field.constant[:, 15], self.field.constant[:, 13]
+        turns = np.rint((middle - home) / (2.0 * np.pi))
+        return np.asarray((first - home - 2.0 * np.pi * turns) * per_rad)
 
     def _begin_day(self, run: _Run, i_day: int) -> None:
         day = self.days[i_day]
