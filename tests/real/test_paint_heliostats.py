@@ -31,8 +31,9 @@ def measured(name):
 
 
 def test_sun_is_where_the_plant_logged_it(figure):
-    # P1. Times are whole seconds and lie 0.45 s after the logged sun on average, evenly over a second; that alone is
-    # 0.04 mrad of azimuth. On the sky (times cos elevation) and with it:
+    # P1. Times are when the plant's database made the record, in whole seconds: after the sun was worked out. They lie
+    # 0.45 s after it on average, evenly over a second; that alone is 0.04 mrad of azimuth.
+    # On the sky (times cos elevation) and with it:
     azimuth, elevation, sky = [], [], []
     for name in heliostat_ids(PAINT):
         data = read_heliostat(PAINT, name)
@@ -189,6 +190,19 @@ def test_a_record_without_a_spot_is_left_out(copy):
     assert data.skipped[path.name.split("_")[0]] == "no focal spot"
     path.write_text(json.dumps(record | {"sun_elevation": -3.0}))
     assert "horizon" in read_heliostat(copy, "BF57").skipped[path.name.split("_")[0]]
+
+
+def test_a_spot_off_the_target_is_left_out(copy):
+    path = first_record(copy)
+    record = json.loads(path.read_text())
+    number = path.name.split("_")[0]
+    assert number not in read_heliostat(copy, "BF57").skipped
+    for step, text in (([0.0, 0.0, 9.0], "from its centre"), ([2e-5, 0.0, 0.0], "behind its plane")):
+        spots = {name: [a + b for a, b in zip(s, step, strict=True)] for name, s in record["focal_spot"].items()}
+        path.write_text(json.dumps(record | {"focal_spot": spots}))
+        reason = read_heliostat(copy, "BF57").skipped[number]
+        assert "focal spot off the target" in reason
+        assert text in reason
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,7 @@ __all__ = ["ALGORITHMS", "PaintHeliostat", "Target", "enu_from_wgs84", "heliosta
 
 ALGORITHMS = ("HeliOS", "UTIS")
 _MOUNT_FRAME = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # columns north, up, east
+_PLANE_M = 0.5
 _WGS84_A, _WGS84_E2 = 6378137.0, 6.69437999014e-3
 
 
@@ -46,10 +47,25 @@ class Target:
         Its centre, site ENU [m].
     normal_enu : (xyz)
         Unit vector out of its front.
+    reach_m
+        From the centre to the farthest corner [m]; infinite if the corners are not told.
     """
 
     centre_enu_m: FloatArray
     normal_enu: FloatArray
+    reach_m: float = float("inf")
+
+    def misses(self, spot_enu_m: FloatArray) -> str | None:
+        """Say how a spot cannot lie on the target, or None."""
+        off = spot_enu_m - self.centre_enu_m
+        distance, depth = float(np.linalg.norm(off)), abs(float(off @ self.normal_enu))
+        if distance > self.reach_m:
+            return (
+                f"focal spot off the target: {distance:.1f} m from its centre, its corners are at {self.reach_m:.1f} m"
+            )
+        if depth > _PLANE_M:
+            return f"focal spot off the target: {depth:.1f} m before or behind its plane"
+        return None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,7 +205,7 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
     origin = _key(tower, tower_path, "power_plant_properties", "coordinates")
     path = _one_file(folder, rf"{re.escape(heliostat)}.*properties\.json$", "the heliostat's properties")
     mount = _mount(_read_json(path), path, origin)
-    times = _times(directory, heliostat)
+    times, targets = _times(directory, heliostat), _targets(tower, origin)
     wanted = ALGORITHMS if algorithm == "both" else (algorithm,)
     rows: list[tuple[float, int, list[float], list[float], FloatArray, float, str]] = []
     skipped: dict[str, str] = {}
@@ -201,6 +217,11 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
             continue
         motors = _key(record, file, "motor_position")
         spots = enu_from_wgs84([record["focal_spot"][name] for name in wanted], origin)
+        target = targets.get(str(record.get("target_name", "")))
+        reason = target.misses(spots.mean(axis=0)) if target else None
+        if reason is not None:
+            skipped[str(number)] = reason
+            continue
         rows.append(
             (
                 times.get(number, np.nan),
@@ -225,7 +246,7 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
             longitude_rad=float(np.radians(origin[1])),
             altitude_m=float(origin[2]),
         ),
-        targets=_targets(tower, origin),
+        targets=targets,
         record_ids=np.array([row[1] for row in rows], np.int64),
         unix_s=np.array([row[0] for row in rows]),
         count=np.array([row[2] for row in rows]),
@@ -319,10 +340,20 @@ def _targets(tower: Mapping[str, Any], origin: Any) -> dict[str, Target]:
         name: Target(
             centre_enu_m=enu_from_wgs84(entry["coordinates"]["center"], origin),
             normal_enu=geometry.unit(entry["normal_vector"]),
+            reach_m=_reach_m(entry["coordinates"], origin),
         )
         for name, entry in tower.items()
         if isinstance(entry, dict) and entry.get("type") == "planar"
     }
+
+
+def _reach_m(coordinates: Mapping[str, Any], origin: Any) -> float:
+    """Distance from a target's centre to its farthest corner."""
+    corners = [place for name, place in coordinates.items() if name != "center"]
+    if not corners:
+        return float("inf")
+    off = enu_from_wgs84(corners, origin) - enu_from_wgs84(coordinates["center"], origin)
+    return float(np.linalg.norm(off, axis=-1).max())
 
 
 def _mount(properties: Mapping[str, Any], path: Path, origin: Any) -> Mount:
