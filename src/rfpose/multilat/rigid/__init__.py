@@ -1,5 +1,6 @@
 """Poses of rigid mirrors from all phases of their receivers at once."""
 
+from rfpose.multilat.rigid.places import ReceiverPlaces, places_bound, refine_places
 from rfpose.multilat.rigid.pose import (
     Knowledge,
     RigidPoses,
@@ -12,9 +13,12 @@ from rfpose.multilat.rigid.pose import (
 
 __all__ = [
     "Knowledge",
+    "ReceiverPlaces",
     "RigidPoses",
     "RigidStatus",
     "full_covariance",
+    "places_bound",
+    "refine_places",
     "rigid_bound",
     "solve_rigid",
     "tilt_sigma_rad",
