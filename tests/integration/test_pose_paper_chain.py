@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "pose_chain.py"
-N_FRAME = 150
+N_FRAME = 80
 # rms angle [mrad] of three fits, rigid with three clocks, rigid with one (Swart et al. §4.5; independent code)
 EXPECTED = {"three fits": (2.65, 2.79), "rigid, three clocks": (2.60, 2.22), "rigid, one clock": (0.49, 0.51)}
 

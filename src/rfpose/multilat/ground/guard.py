@@ -203,7 +203,7 @@ class _Guard:
             sigma = np.where(weight > 0.0, weight**-0.5, np.nan)
             every = np.where(mirrors.weight[rows] > 0.0, mirrors.weight[rows] ** -0.5, np.nan)
         free = np.equal(mirrors.bias_info[rows][..., i : i + 1], 0.0)
-        middle = np.nanmedian(np.where(np.isfinite(left), left, 0.0), axis=2, keepdims=True)
+        middle = quiet_median(left)[..., None]
         # without calibration nothing that all receivers have in common is an error
         error = np.where(free, left - middle, left)
         relative = np.abs(error) / sigma
