@@ -172,6 +172,13 @@ def test_budget_without_draws_and_over_postures():
     assert two["sum"]["normal_mrad"] == pytest.approx(mean)
 
 
+def test_budget_says_what_is_beyond_first_order(tmp_path):
+    site = broken(tmp_path, "[simulation]\n", "[simulation]\nground = { coefficient = [-0.3, 0.1] }\n")
+    text = " ".join(run("budget", site, "--draws", 200).split())
+    assert "ground reflection: drawn and first order differ" in text
+    assert "receiver places: drawn" not in text
+
+
 def test_curve_over_numbers_of_transmitters(tmp_path):
     table, picture = tmp_path / "curve.csv", tmp_path / "curve.png"
     wanted = ("--pareto", "6..8", "--starts", 1, "--cost", 5, 0.1, 0.01, "--csv", table, "--picture", picture)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -21,8 +22,17 @@ from rfpose.cli.layout._options import field_options, postures
 
 __all__ = ["command"]
 
+_SIGMAS = 2.5
+"""By how many standard deviations drawn and first order may differ."""
 _WORTH_A_REMEDY = 0.01
 """Share of the variance from which a source's remedy is printed."""
+
+
+def _say_where_not_linear(line: dict[str, Any], n_draw: int) -> None:
+    drawn = line["monte_carlo_mrad"]
+    # the rms of one number drawn n times scatters by 1/√(2n); with nothing drawn or solved there is NaN, and no more
+    if abs(line["normal_mrad"] - drawn) > _SIGMAS * (2.0 * max(n_draw, 1)) ** -0.5 * drawn:
+        say(f"{line['source']}: drawn and first order differ by more than chance explains; trust what is drawn")
 
 
 @click.command(
@@ -103,5 +113,6 @@ def command(
     for line in summary["lines"]:
         if line["share"] >= _WORTH_A_REMEDY:
             say(f"{line['source']} ({line['assumed']}): {line['remedy']}")
+            _say_where_not_linear(line, summary["draws"])
     if summary["solutions_failed"]:
         say(f"{summary['solutions_failed']} drawn solutions failed: that error is beyond first order")
