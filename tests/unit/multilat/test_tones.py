@@ -1,6 +1,7 @@
 """Choosing tones: what is promised holds in simulation, and what cannot be had is refused in words."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rfpose.multilat import range_differences
 from rfpose.multilat.tones import design_tones, ladder_risk, ladder_sigma_m
 
 REACH = 120.0
+SCENARIO = str(Path(__file__).parents[3] / "data" / "table2_100m.toml")
 
 
 def design(**settings):
@@ -90,14 +92,12 @@ def test_sharing_costs():
 
 def test_command_names_tones_for_a_scenario():
     run = CliRunner().invoke(
-        app, ["layout", "tones", "data/table2_100m.toml", "--accuracy-mrad", "0.05", "--band", "1e5", "1e9", "--json"]
+        app, ["layout", "tones", SCENARIO, "--accuracy-mrad", "0.05", "--band", "1e5", "1e9", "--json"]
     )
     assert run.exit_code == 0, run.output
     found = json.loads(run.stdout)
     assert found["normal_mrad"] == pytest.approx(0.05, rel=1e-6)
     assert found["wrong_risk"] <= 1e-6
-    run = CliRunner().invoke(
-        app, ["layout", "tones", "data/table2_100m.toml", "--accuracy-mrad", "0.01", "--band", "1e5", "2e6"]
-    )
+    run = CliRunner().invoke(app, ["layout", "tones", SCENARIO, "--accuracy-mrad", "0.01", "--band", "1e5", "2e6"])
     assert run.exit_code == 3
     assert "band too narrow" in run.output
