@@ -446,7 +446,8 @@ class LayoutView(View):
             if name not in self._handles:
                 handle = pg.TargetItem(
                     size=15, symbol="t1", pen=pg.mkPen(self.theme.text, width=1.5), brush="#D55E00",
-                    hoverBrush="#E69F00", label=name, labelOpts={"color": self.theme.text, "offset": (8, 8), "fill": see_through(self.theme.plot)},
+                    hoverBrush="#E69F00", label=name,
+                    labelOpts={"color": self.theme.text, "offset": (8, 8), "fill": see_through(self.theme.plot)},
                 )  # fmt: skip
                 handle.sigPositionChanged.connect(lambda item, name=name: self._dragged(name, item))
                 handle.sigPositionChangeFinished.connect(lambda _: self._drag_ended())

@@ -1,0 +1,186 @@
+"""Pictures and reports without a screen, the command, and what it says where the viewer cannot start."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from PySide6.QtGui import QImage
+
+from rfpose.cli import _app
+from rfpose.cli import view as command
+from rfpose.errors import InvalidInputError, RfposeError
+from rfpose.viewer import app, export
+
+
+def run(*arguments: object) -> object:
+    return CliRunner().invoke(_app.app, ["view", *map(str, arguments)])
+
+
+def test_names_of_views_are_one() -> None:
+    from rfpose.viewer.window import VIEWS
+
+    assert command.VIEW_NAMES == export.VIEW_NAMES == tuple(kind.name for kind in VIEWS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "view"), [("recording", "recording"), ("result", "field"), ("scenario", "layout"), ("result", "recording")]
+)
+def test_each_view_becomes_a_picture(qapp, files: dict[str, Path], tmp_path: Path, kind: str, view: str) -> None:
+    out = tmp_path / "out.png"
+    done = run(files[kind], "--view", view, "--save", out, "--size", 900, 600, "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {"file": str(files[kind]), "saved": str(out), "view": view}
+    picture = QImage(str(out))
+    assert picture.width() > 800
+    colours = {picture.pixel(x, y) for x in range(0, picture.width(), 3) for y in range(0, picture.height(), 3)}
+    assert len(colours) > 20
+
+
+def test_svg_holds_text_that_can_be_read(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.svg"
+    assert run(files["result"], "--heliostat", "H02", "--frame", 1, "--save", out).exit_code == 0
+    texts = "".join(ET.parse(out).getroot().itertext())
+    for word in ("T10", "north [m]", "H02", "2 of 3"):
+        assert word in texts
+
+
+def test_report_is_one_file_with_pictures_tables_settings_and_versions(
+    qapp, files: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "report.html"
+    done = run(files["result"], "--save", out, "--size", 900, 600)
+    assert done.exit_code == 0, done.output
+    page = out.read_text()
+    assert page.count("data:image/png;base64,") == 6  # recording, the field in four colourings, layout
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    for word in (
+        "carrier not found above the noise",
+        "estimator",
+        "hilbert",
+        "numpy",
+        "PySide6",
+        "mirror normal [mrad]",
+    ):
+        assert word in page
+    assert "[[transmitter]]" in page
+
+
+def test_report_escapes_what_the_file_says(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "a<b>.toml"
+    path.write_text(files["scenario"].read_text().replace('name = "', 'name = "<script>', 1))
+    out = tmp_path / "report.html"
+    assert run(path, "--save", out, "--size", 900, 600).exit_code == 0
+    assert "<script>" not in out.read_text()
+    assert "a&lt;b&gt;.toml" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["{scenario}", "--save", "{tmp}/a.pdf"], 3, "must end in .png, .svg, .html"),
+        (["{scenario}", "--save", "{tmp}/a.png", "--view", "recording"], 3, "`recording` has nothing to show"),
+        (
+            ["{scenario}", "--save", "{tmp}/a.png", "--heliostat", "H99"],
+            3,
+            "no heliostat `H99`; choose one of H01, H02",
+        ),
+        (["{tmp}/none.h5", "--save", "{tmp}/a.png"], 3, "no such file"),
+        (["{scenario}", "--save", "{scenario}"], 3, "exists already"),
+        (["{scenario}", "--save", "{tmp}/no/where/a.png"], 3, "its directory does not exist"),
+        (["--save", "{tmp}/a.png"], 2, "--save needs a FILE"),
+    ],
+)
+def test_what_cannot_be_drawn_is_one_line(
+    qapp, files: dict[str, Path], tmp_path: Path, arguments: list[str], code: int, message: str
+) -> None:
+    done = run(*(part.format(tmp=tmp_path, scenario=files["scenario"]) for part in arguments))
+    assert done.exit_code == code
+    assert message in done.stderr
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_other_ending_is_refused_before_work(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="must end in"):
+        export.export(tmp_path / "none.h5", tmp_path / "a.pdf")
+
+
+# -- what is missing -----------------------------------------------------------------------------------------
+
+
+def rfpose_view(code: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
+    """Run `rfpose view` in a program of its own, after ``code``."""
+    env = {k: v for k, v in (os.environ | environment).items() if v is not None}
+    text = f"import sys\n{code}\nsys.argv = ['rfpose', 'view']\nfrom rfpose.cli import main\nmain()"
+    return subprocess.run(
+        [sys.executable, "-c", text], capture_output=True, text=True, env=env, timeout=60, check=False
+    )
+
+
+def test_without_the_extra(tmp_path: Path) -> None:
+    hide = (
+        "import importlib.util as u; find = u.find_spec\n"
+        "u.find_spec = lambda name, *a: None if name.split('.')[0] in ('PySide6', 'pyqtgraph') else find(name, *a)"
+    )
+    done = rfpose_view(hide)
+    assert done.returncode == 3
+    assert done.stderr.splitlines() == [
+        "rfpose: the viewer needs PySide6 and pyqtgraph; install the extra: pip install 'rfpose[gui]'"
+    ]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="X and Wayland are Linux's")
+def test_without_a_screen() -> None:
+    done = rfpose_view("", DISPLAY=None, WAYLAND_DISPLAY=None, QT_QPA_PLATFORM=None)
+    assert done.returncode == 3
+    assert done.stderr.startswith("rfpose: no screen")
+    assert "--save" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="X is Linux's")
+def test_screen_that_does_not_answer_or_lacks_its_libraries() -> None:
+    done = rfpose_view("", DISPLAY=":987", WAYLAND_DISPLAY=None, QT_QPA_PLATFORM=None)
+    assert done.returncode == 3
+    assert re.search("does not answer|apt install libxcb", done.stderr)
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("libEGL.so.1: cannot open shared object file: No such file", "apt install libegl1"),
+        ("libsomething.so.3: cannot open shared object file", "the system package that holds libsomething.so"),
+        ("undefined symbol: x", "pip install --force-reinstall"),
+    ],
+)
+def test_missing_library_is_named_with_its_package(text: str, message: str) -> None:
+    assert message in app._missing_library(text)
+
+
+def test_binding_that_kills_an_older_interpreter_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import PySide6
+
+    monkeypatch.setattr(PySide6, "__version__", "6.12.0")
+    monkeypatch.setattr(sys, "version_info", (3, 11, 2))
+    with pytest.raises(RfposeError, match=r"PySide6-Essentials<6\.12"):
+        app.check_installed()
+
+
+def test_font_is_brought_where_the_system_has_none(qapp, monkeypatch: pytest.MonkeyPatch) -> None:
+    from PySide6.QtGui import QFontDatabase
+
+    from rfpose.viewer.theme import ensure_font
+
+    before = qapp.font()
+    monkeypatch.setattr(QFontDatabase, "families", staticmethod(lambda: []))
+    ensure_font(qapp)
+    assert qapp.font().family() == "DejaVu Sans"
+    qapp.setFont(before)
