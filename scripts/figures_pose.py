@@ -172,6 +172,34 @@ def delays(directory: Path) -> None:
     save(figure, directory, "pose-delays")
 
 
+def edge() -> None:
+    """Print what learned delays leave where one clock is worth most: at the edge, facing the tower."""
+    pivot, rot, n_frame = np.array([[100.0, 0.0, 0.0]]), rot_enu_from_mirror(np.array([[-1.0, 0.0, 1.0]])), 50
+    one = bound(pivot, rot, [RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0))[0]
+    whole = full_covariance(
+        TRANSMITTER,
+        PLACES,
+        pivot,
+        rot,
+        sigma_m=np.full((1, 1, 3, 10), RANGE_SIGMA_M),
+        transmitter_sigma_m=1e-7,
+        clock_class=[0],
+    )
+    for rate_ps, interval_s in ((0.0, 60.0), (1.0, 1.0), (1.0, 10.0), (1.0, 60.0)):
+        learned = learn_delays(
+            np.tile(pivot, (n_frame, 1, 1)),
+            np.tile(rot, (n_frame, 1, 1, 1)),
+            np.zeros((n_frame, 1, 1, 3)),
+            np.tile(whole, (n_frame, 1, 1, 1)),
+            time_s=interval_s * np.arange(n_frame),
+            drift_m_per_sqrt_s=rate_ps * 1e-12 * SPEED / np.sqrt(60.0),
+        )
+        ratio = tilt_sigma_rad(learned.cov[-1], rot[:, :, 2])[0] / one
+        print(
+            f"edge, {rate_ps:g} ps/sqrt(min), frames {interval_s:g} s apart: frame 50 at {ratio:.2f} of one clock's bound"
+        )
+
+
 def reflection(directory: Path) -> None:
     """Error of the normal over the coefficient's size: ignored, estimated, without any reflection."""
     n, rf_hz = 60, 100e6
@@ -302,6 +330,7 @@ def main() -> None:
     directory.mkdir(parents=True, exist_ok=True)
     for draw in (clocks, delays, integrity, reflection):
         draw(directory)
+    edge()
 
 
 if __name__ == "__main__":
