@@ -195,9 +195,7 @@ def edge() -> None:
             drift_m_per_sqrt_s=rate_ps * 1e-12 * SPEED / np.sqrt(60.0),
         )
         ratio = tilt_sigma_rad(learned.cov[-1], rot[:, :, 2])[0] / one
-        print(
-            f"edge, {rate_ps:g} ps/sqrt(min), frames {interval_s:g} s apart: frame 50 at {ratio:.2f} of one clock's bound"
-        )
+        print(f"edge, {rate_ps:g} ps/sqrt(min), {interval_s:g} s apart: frame 50 at {ratio:.2f} of one clock's bound")
 
 
 def reflection(directory: Path) -> None:
