@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numba
 
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import Simulation
 from rfpose.scenario import load_scenario
 
 SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
@@ -29,22 +29,23 @@ from rfpose.scenario import load_scenario
 base = load_scenario(sys.argv[1])
 tracking = base.tracking.model_copy(update={"first_hour": 9.0, "last_hour": 9.1})
 simulation = Simulation(base.model_copy(update={"tracking": tracking}), methods=("radio",), count=4, seed=1)
-start = time.perf_counter()
+start = time.process_time()
 simulation.advance()
-print((time.perf_counter() - start) / (4 * len(simulation.days[0].unix_s)))
+print((time.process_time() - start) / (4 * len(simulation.days[0].unix_s)))
 """
 
 
-def track(n: int, n_segment: int | None) -> tuple[float, Simulation]:
-    """Seconds a mirror and step, and the simulation."""
+def track(n: int, n_segment: int | None) -> tuple[float, float, Simulation]:
+    """Seconds and seconds of processor a mirror and step, and the simulation."""
     simulation = Simulation(load_scenario(SCENARIO), methods=("radio",), count=n, seed=1)
     simulation.advance()
     last = simulation.n_segment if n_segment is None else min(1 + n_segment, simulation.n_segment)
     steps = simulation.segments[last - 1].end - simulation.segments[0].end
-    start = time.perf_counter()
+    start, start_cpu = time.perf_counter(), time.process_time()
     while simulation.done < last:
         simulation.advance()
-    return (time.perf_counter() - start) / (n * steps), simulation
+    work = n * steps
+    return (time.perf_counter() - start) / work, (time.process_time() - start_cpu) / work, simulation
 
 
 def main() -> None:
@@ -53,29 +54,27 @@ def main() -> None:
     parser.add_argument("--heliostats", type=int, default=10_000)
     parser.add_argument("--whole", action="store_true", help="track the whole day, not an hour")
     arguments = parser.parse_args()
-    print(f"{numba.get_num_threads()} threads")
-    print("mirrors   ns a mirror and second   day of 10.4 h   memory so far")
-    fastest = float("inf")
+    print(f"{numba.get_num_threads()} threads, load {os.getloadavg()[0]:.1f}")
+    print("mirrors   ns a mirror and second: elapsed, processor   day: elapsed, processor over two   memory so far")
+    least = float("inf")
     for n in (100, 1000, arguments.heliostats):
         whole = arguments.whole and n == arguments.heliostats
-        each, simulation = track(n, None if whole else 4)
-        fastest = min(fastest, each)
-        day = each * n * len(simulation.days[0].unix_s)
+        each, cpu, simulation = track(n, None if whole else 4)
+        least = min(least, cpu)
+        day = n * len(simulation.days[0].unix_s)
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"{n:7d} {1e9 * each:21.0f} {day:15.0f} s {'' if whole else '*':1} {memory:13.2f} GB")
-    print(
-        "* extrapolated"
-        if not arguments.whole
-        else f"rms {1e3 * score(simulation.sums('radio')).normal_rms_rad:.3f} mrad"
-    )
+        print(
+            f"{n:7d} {1e9 * each:22.0f} {1e9 * cpu:22.0f} {each * day:17.0f} s {0.5 * cpu * day:17.0f} s"
+            f"{' ' if whole else '*'} {memory:15.2f} GB",
+            flush=True,
+        )
+    print("* extrapolated")
     done = subprocess.run(
         [sys.executable, "-c", PLAIN, str(SCENARIO)],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True, check=True,
     )  # fmt: skip
     plain = float(done.stdout)
-    print(
-        f"the same code as plain Python: {1e6 * plain:.0f} µs a mirror and second, {plain / fastest:.0f} times as long"
-    )
+    print(f"the same code as plain Python: {1e6 * plain:.0f} µs of processor, {plain / least:.0f} times as much")
 
 
 if __name__ == "__main__":

@@ -76,6 +76,8 @@ def track(
         "heliostats": str(len(simulation.field)),
     }
     key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
+    if scenario.tracking.wind.record is not None:
+        key["wind"] = hashlib.sha256(Path(scenario.tracking.wind.record).read_bytes()).hexdigest()
     place = result_path.with_name(f".{result_path.name}.state")
     checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
     state = checkpoint.read()

@@ -56,6 +56,8 @@ class Wind(Record):
     """Steady wind with gusts after Edwards (5.24), and how far it bends a mirror."""
 
     mean_speed_mps: NonNegative = 4.0
+    record: str | None = None
+    """CSV of measured speeds instead; its path from where the command is run."""
     deflection_mrad_per_mps2: Two = (0.003, 0.006)
     """Of the normal, sideways and up, by a steady wind of 1 m/s; it grows with the square of the speed."""
 

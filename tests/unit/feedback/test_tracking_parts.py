@@ -163,6 +163,25 @@ def test_deflection_grows_with_the_square_of_the_wind():
     assert fast.variance_rad2 == pytest.approx(16.0 * slow.variance_rad2, rel=0.3)
 
 
+def test_a_wind_record_is_felt_as_it_was(tmp_path):
+    (day,) = days(load_scenario(DATA))
+    begin = day.unix_s[0] - 10.0
+    speed = 3.0 + 2.0 * np.sin(np.arange(40_000) / 50.0)
+    path = tmp_path / "wind.csv"
+    path.write_text("unix_s,speed_mps\n" + "".join(f"{begin + i:.0f},{v:.4f}\n" for i, v in enumerate(speed)))
+    gusts = Gusts(changed(wind={"record": str(path)}))
+    gusts.check_covers([day])
+    times = day.unix_s[100:200]
+    felt = gusts.run(np.zeros((3, 1)), np.random.default_rng(0), times)
+    want = np.interp(times, begin + np.arange(40_000), speed) ** 2
+    got = gusts.bend_rad(felt.astype(np.float64)) / gusts.bend
+    np.testing.assert_allclose(got, np.broadcast_to(want[:, None], (3, 100, 2)), rtol=2e-3)
+    assert gusts.mean_mps == pytest.approx(np.sqrt(np.mean(speed**2)), rel=1e-3)
+    late = changed(wind={"record": str(path)}, date=datetime.date(2026, 3, 25))
+    with pytest.raises(ScenarioError, match="does not reach over 2026-03-25"):
+        Gusts(late).check_covers(days(late))
+
+
 # ---- radio --------------------------------------------------------------------------------------------------------
 
 

@@ -153,6 +153,7 @@ class Simulation:
         course = self.days[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
         self.field: Field = draw_field(scenario, count=count, seed=self.seed, sun_enu=course)
         self.gusts = Gusts(scenario)
+        self.gusts.check_covers(self.days)
         needs_radio = any(m.radio for m in self.methods)
         self.margins: Margins | None = check_gains(scenario) if needs_radio else None
         self.radio = None
@@ -332,7 +333,9 @@ class Simulation:
         n_step = segment.end - segment.first
         control = round(plan.control_interval_s / plan.servo_interval_s)
         n_frame = -(-n_step // control)
-        gust = self.gusts.run(self._gust_state, generator(self.seed, 2, *place), n_step)
+        gust = self.gusts.run(
+            self._gust_state, generator(self.seed, 2, *place), day.unix_s[segment.first : segment.end]
+        )
         rng = generator(self.seed, 3, *place)
         noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
         lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.errors import ScenarioError
+from rfpose.feedback.tracking.timeline import Day
 from rfpose.feedback.wind.gusts import gust_process
+from rfpose.feedback.wind.record import WindRecord, read_wind_csv
 from rfpose.scenario import Scenario
 
 __all__ = ["Gusts"]
@@ -26,6 +31,10 @@ class Gusts:
     def __init__(self, scenario: Scenario) -> None:
         plan = scenario.tracking
         self.mean_mps = plan.wind.mean_speed_mps
+        self._record: WindRecord | None = None
+        if plan.wind.record is not None:
+            self._record = read_wind_csv(plan.wind.record, interval_s=plan.servo_interval_s)
+            self.mean_mps = float(np.sqrt(np.nanmean(self._record.speed_mps**2)))
         self.bend = 1e-3 * np.array(plan.wind.deflection_mrad_per_mps2)
         self.process = gust_process(
             self.mean_mps, interval_s=plan.servo_interval_s, size_m=float(np.sqrt(plan.mirror_area_m2))
@@ -34,19 +43,56 @@ class Gusts:
     @property
     def variance_rad2(self) -> float:
         """Mean variance of the deflection, right and up, the steady part left out [rad²]."""
-        return float(np.mean((2.0 * self.mean_mps * self.process.sigma_mps * self.bend) ** 2))
+        sigma = self.process.sigma_mps if self._record is None else float(np.std(self._recorded()))
+        return float(np.mean((2.0 * self.mean_mps * sigma * self.bend) ** 2))
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
         """Return gusts that know nothing of each other [m/s]."""
+        if self._record is not None:
+            return np.asarray(rng.choice(self._recorded(), shape))
         return np.asarray(self.process.sigma_mps * rng.standard_normal(shape))
+
+    def _recorded(self) -> FloatArray:
+        """Return the record's known samples as gusts about the mean, so that V² + 2 V u is the square of the speed."""
+        assert self._record is not None
+        speed = self._record.speed_mps[np.isfinite(self._record.speed_mps)]
+        return np.asarray((speed**2 - self.mean_mps**2) / (2.0 * max(self.mean_mps, 1e-9)))
+
+    def check_covers(self, days: Sequence[Day]) -> None:
+        """Refuse a record that ends before the field does.
+
+        Raises
+        ------
+        ScenarioError
+            It does not reach over all days.
+        """
+        if self._record is None:
+            return
+        first, last = self._record.unix_s[[0, -1]]
+        for day in days:
+            if not (first <= day.unix_s[0] and day.unix_s[-1] <= last):
+                raise ScenarioError(
+                    f"[tracking.wind] `record` does not reach over {day.date}: give a longer one, another `date`, or "
+                    "`first_hour` and `last_hour` within it"
+                )
 
     def bend_rad(self, gust_mps: FloatArray) -> FloatArray:
         """Return the deflection of normals, right and up (…, 2) [rad]."""
         return np.asarray((self.mean_mps**2 + 2.0 * self.mean_mps * gust_mps)[..., None] * self.bend)
 
-    def run(self, state: FloatArray, rng: np.random.Generator, n_step: int) -> npt.NDArray[np.float32]:
-        """Go on from a state of the process, in place; gusts (mirror, step) [m/s]."""
+    def run(self, state: FloatArray, rng: np.random.Generator, unix_s: FloatArray) -> npt.NDArray[np.float32]:
+        """Go on from a state of the process, in place; gusts (mirror, step) [m/s].
+
+        With a record all mirrors feel the same wind; in its gaps it is steady.
+        """
+        n_step = len(unix_s)
         out = np.empty((len(state), n_step), np.float32)
+        if self._record is not None:
+            known = np.isfinite(self._record.speed_mps)
+            gust = np.zeros(len(known))
+            gust[known] = self._recorded()
+            out[:] = np.interp(unix_s, self._record.unix_s, gust)
+            return out
         for first in range(0, len(state), _BLOCK):
             block = slice(first, first + _BLOCK)
             out[block] = self.process.run(state[block], rng, n_step)
