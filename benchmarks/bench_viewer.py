@@ -19,6 +19,7 @@ os.environ["QT_QPA_PLATFORM"] = "offscreen"
 import h5py
 import numpy as np
 import psutil
+from PySide6.QtCore import QEvent, QObject
 
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
@@ -118,6 +119,17 @@ def open_large(gigabytes: float) -> None:
         window.close()
 
 
+class Paints(QObject):
+    """Counts how often a widget is drawn."""
+
+    count = 0
+
+    def eventFilter(self, _: QObject, event: QEvent) -> bool:  # noqa: N802
+        """Look at an event, and let it pass."""
+        self.count += event.type() == QEvent.Type.Paint
+        return False
+
+
 def drag(n_heliostat: int, n_step: int) -> None:
     """Drag a transmitter around a circle, as fast as pictures come."""
     site = load_scenario(shipped_scenario("table2_100m.toml"))
@@ -133,6 +145,8 @@ def drag(n_heliostat: int, n_step: int) -> None:
         path.write_text(Scenario.model_validate(data).to_toml())
         app, window = open_window(path)
     view, edit = window.views["layout"], window.session.layout
+    paints = Paints()
+    view.graphs.viewport().installEventFilter(paints)
     for estimator in ("rigid", "shared-clock", "independent", "carrier"):
         edit.choose(estimator=estimator)
         settle(app, window)
@@ -147,7 +161,9 @@ def drag(n_heliostat: int, n_step: int) -> None:
             while view.map is shown:
                 app.processEvents()
                 time.sleep(0.0005)
-            view.graphs.viewport().repaint()
+            drawn = paints.count
+            while paints.count == drawn:
+                app.processEvents()
             now = time.perf_counter()
             worst, last, maps = max(worst, now - last), now, maps + 1
         edit.end_drag()

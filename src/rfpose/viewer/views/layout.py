@@ -47,7 +47,7 @@ from rfpose.pipeline.live_layout import (
 from rfpose.viewer.state.layout_edit import LayoutEdit
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme, see_through
-from rfpose.viewer.views.parts import Dots, Scale, View, plot_in
+from rfpose.viewer.views.parts import Dots, Scale, View, keep_axes, plot_in
 from rfpose.viewer.workers import Workers
 
 __all__ = ["LayoutView"]
@@ -100,6 +100,7 @@ class LayoutView(View):
         self.graphs = pg.GraphicsLayoutWidget()
         self.plot = plot_in(self.graphs, theme, x="east [m]", y="north [m]")
         self.plot.setAspectLocked(True)
+        keep_axes(self.plot)
         self.dots = Dots(rim=theme.muted)
         self.plot.addItem(self.dots)
         self.worst = pg.ScatterPlotItem(size=20, pen=pg.mkPen("#D55E00", width=2.5), brush=None)

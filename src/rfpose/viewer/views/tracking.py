@@ -14,7 +14,7 @@ from rfpose.pipeline.track_view import TrackPicture
 from rfpose.viewer.state.playback import SPEEDS
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import SERIES, Theme, see_through
-from rfpose.viewer.views.parts import Dots, Scale, Table, View, plot_in, segments
+from rfpose.viewer.views.parts import Dots, Scale, Table, View, keep_axes, plot_in, segments
 from rfpose.viewer.workers import Workers
 
 __all__ = ["TrackingView"]
@@ -76,6 +76,7 @@ class TrackingView(View):
         self.map = pg.GraphicsLayoutWidget()
         self.plan_plot = plot_in(self.map, theme, x="east [m]", y="north [m]")
         self.plan_plot.setAspectLocked(True)
+        keep_axes(self.plan_plot)
         self.beams = pg.PlotCurveItem(pen=pg.mkPen(230, 159, 0, 90, width=1), connect="pairs")
         self.normals = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1.5), connect="pairs")
         self.dots = Dots(rim=theme.muted)

@@ -1,0 +1,123 @@
+"""Pictures of the viewer for docs/viewer.md, drawn without a screen: docs/images/viewer_*.png.
+
+    .venv/bin/python scripts/screenshots.py [--output DIRECTORY]
+
+Each view at 1280 × 800 in the light theme, two in the dark one, and one at a scaling of 200 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+os.environ["QT_QPA_PLATFORM"] = "offscreen"
+
+from rfpose.layout.fields import radial_staggered
+from rfpose.pipeline.demo import shipped_scenario
+from rfpose.pipeline.process import process
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.track import track
+from rfpose.scenario import Scenario, load_scenario
+from rfpose.viewer.export import open_window, png_of, settle
+
+SCALED = "viewer_field_200_percent.png"
+
+
+def site(folder: Path) -> Path:
+    """Table 2's field with ten frames, a transmitter that two mirrors do not see, and a lost stretch."""
+    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
+    data["radio"]["frame_samples"] = 100_000
+    data["site"] |= {"latitude_deg": 37.1, "longitude_deg": -2.4}
+    data["simulation"] |= {
+        "frame_count": 10,
+        "tone_snr_db": 30.0,
+        "blocked": [{"transmitter": "T4", "receivers": ["H05", "H09"]}],
+        "dropped": [{"receiver": "H02_r0", "frame": 4, "first_sample": 500, "sample_count": 20_000}],
+    }
+    path = folder / "site.toml"
+    path.write_text(Scenario.model_validate(data).to_toml())
+    return path
+
+
+def large_site(folder: Path) -> Path:
+    """Two thousand mirrors to lay transmitters out for."""
+    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
+    like = data["heliostat"][0]
+    places = radial_staggered(2000, first_radius_m=12.0, diagonal_m=3.4, height_m=2.0).tolist()
+    data["heliostat"] = [
+        like | {"id": f"H{k}", "pivot_enu_m": tuple(p), "receiver_ids": tuple(f"H{k}_r{i}" for i in range(3))}
+        for k, p in enumerate(places)
+    ]
+    path = folder / "field.toml"
+    path.write_text(Scenario.model_validate(data).to_toml())
+    return path
+
+
+def shoot(path: Path, output: Path, *, view: str, theme: str = "light", frame: int = 0, **chosen: int) -> None:
+    """Write a picture of the whole window."""
+    app, window = open_window(path, theme=theme)
+    window.go_to(view)
+    window.session.select(frame=frame, **chosen)
+    window.session.playback.scrub(frame)
+    if path.name == "field.toml":
+        window.session.layout.choose(posture="sun")
+    settle(app, window)
+    output.write_bytes(png_of(window))
+    window.close()
+    app.processEvents()
+    print(output)
+
+
+def welcome(output: Path, path: Path) -> None:
+    """Write a picture of the first page."""
+    app, window = open_window(path)
+    window.welcome.show_recent(("recording.h5", "result.h5", "day.h5", "site.toml"))
+    window.session.show(None)
+    settle(app, window)
+    output.write_bytes(png_of(window))
+    window.close()
+    app.processEvents()
+    print(output)
+
+
+def main() -> None:
+    """Make files to show, then the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path(__file__).resolve().parents[1] / "docs" / "images")
+    parser.add_argument("--scaled", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    out: Path = options.output
+    if options.scaled is not None:
+        shoot(options.scaled, out / SCALED, view="field", frame=5, heliostat=4)
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    out, before = out.resolve(), Path.cwd()
+    with tempfile.TemporaryDirectory() as name:
+        os.chdir(name)  # so that the pictures show names and no places
+        folder = Path()
+        scenario, recording, result, day = (Path(n) for n in ("site.toml", "recording.h5", "result.h5", "day.h5"))
+        site(folder)
+        simulate_recording(scenario, recording, seed=1)
+        process(recording, result)
+        track(shipped_scenario("tracking_100m.toml"), day, heliostats=40)
+        welcome(out / "viewer_welcome.png", scenario)
+        shoot(recording, out / "viewer_recording.png", view="recording", frame=3, transmitter=2)
+        shoot(recording, out / "viewer_recording_dark.png", view="recording", frame=3, transmitter=2, theme="dark")
+        shoot(result, out / "viewer_field.png", view="field", frame=5, heliostat=4)
+        shoot(large_site(folder), out / "viewer_layout.png", view="layout")
+        shoot(scenario, out / "viewer_layout_dark.png", view="layout", theme="dark")
+        shoot(day, out / "viewer_tracking.png", view="tracking", frame=150)
+        subprocess.run(
+            [sys.executable, str(Path(__file__).resolve()), "--output", str(out), "--scaled", str(result)],
+            env=os.environ | {"QT_SCALE_FACTOR": "2"},
+            check=True,
+        )
+        os.chdir(before)
+
+
+if __name__ == "__main__":
+    main()
