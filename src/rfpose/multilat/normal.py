@@ -47,8 +47,8 @@ _REASON = {
     PoseStatus.RESIDUAL: "solved, but a receiver's residuals are far above what the sigma of the ranges allows",
     PoseStatus.UNDETERMINED: "the measurements leave part of the pose open; more transmitters or a surveyed pivot help",
     PoseStatus.NOT_CONVERGED: "the pose did not converge",
-    PoseStatus.UNEXPLAINED: "solved, but residuals are larger than noise and a few bad transmitters explain: a reflection "
-    "that is not in the model?",
+    PoseStatus.UNEXPLAINED: "solved, but residuals are larger than noise and a few bad transmitters explain: "
+    "a reflection that is not in the model?",
     PoseStatus.BEHIND_REFLECTOR: "a receiver lies behind a reflecting plane (below the ground)",
     PoseStatus.UNKNOWNS: "fewer measurements than unknowns: more transmitters received, a surveyed pivot, a mount or "
     "known delays would help",
