@@ -448,6 +448,7 @@ def test_cancelled_optimiser_leaves_the_layout_alone(
 ) -> None:
     view, edit = laid_out, window.session.layout
     view.starts.setValue(500)
+    view.separation.setValue(0.0)
     view.run_button.click()
     assert view.cancel_button.isEnabled()
     job = next(job for job in window.workers.jobs if job.name == "Optimiser")
@@ -547,6 +548,7 @@ def test_closing_during_work_ends_it(preferences: Preferences, files: dict[str, 
     wait(window, lambda: layout_of(window).map is not None)
     view = layout_of(window)
     view.starts.setValue(500)
+    view.separation.setValue(0.0)
     view.run_button.click()
     jobs = window.workers.jobs
     assert jobs
