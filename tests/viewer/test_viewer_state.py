@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError, ScenarioError
+from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.demo import shipped_scenario
+from rfpose.pipeline.field_view import history, project
+from rfpose.pipeline.result_file import read_result
 from rfpose.scenario import Scenario, load_scenario, parse_scenario
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
@@ -262,3 +266,44 @@ def test_selection_stays_inside_the_document(files: dict[str, Path]) -> None:
     assert now.receiver == "H01_r0"
     session.show(None)
     assert session.selection.receiver is None
+
+
+# -- what the field view is told -----------------------------------------------------------------------------
+
+
+def test_history_names_what_the_tests_threw_out(files: dict[str, Path]) -> None:
+    result = read_result(files["result"])
+    assert result.integrity is not None
+    status = np.zeros_like(result.integrity.transmitter_status)
+    status[1:, 1, 6] = TransmitterStatus.INTERFERENCE
+    rejected = np.zeros_like(result.integrity.prior_rejected)
+    rejected[0, 1, 0] = True
+    tests = replace(result.integrity, transmitter_status=status, prior_rejected=rejected)
+    found = {
+        (e.transmitter_id, e.count, e.total, e.unit) for e in history(replace(result, integrity=tests), 1).exclusions
+    }
+    assert {("T7", 2, 3, "frames"), ("pivot", 1, 3, "frames")} <= found
+    others = history(replace(result, integrity=tests), 0).exclusions
+    assert {e.transmitter_id for e in others} == {"T4"}  # blocked, and so never received
+
+
+def test_ellipse_holds_the_covariance(files: dict[str, Path]) -> None:
+    """Its semi-axes are 2.448 sigmas: the chi-square of two dimensions at 95 %."""
+    result = read_result(files["result"])
+    found = history(result, 0)
+    outline = found.ellipse_mrad - found.offset_mrad[:, None]
+    axes = np.linalg.norm(outline, axis=2)
+    cov = result.poses.cov_enu[:, 0]
+    sizes = np.sqrt(np.linalg.eigvalsh(cov)[:, 1:])  # the smallest lies along the normal
+    np.testing.assert_allclose(axes.max(axis=1), 2448.0 * sizes[:, 1], rtol=5e-3)
+    np.testing.assert_allclose(axes.min(axis=1), 2448.0 * sizes[:, 0], rtol=5e-3)
+    total = np.sqrt(np.trace(cov, axis1=1, axis2=2))
+    np.testing.assert_allclose(found.sigma_mrad, 1e3 * total, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("azimuth", "right"), [(180.0, (1, 0)), (270.0, (0, -1)), (0.0, (-1, 0))])
+def test_projection_puts_what_is_to_the_right_to_the_right(azimuth: float, right: tuple[int, int]) -> None:
+    """An eye in the south has east to its right; in the west, south."""
+    seen = project(np.array([[*right, 0.0], [0.0, 0.0, 1.0]]), np.radians(azimuth), np.radians(20.0))
+    np.testing.assert_allclose(seen[0, 0], 1.0, atol=1e-12)
+    assert seen[1, 1] > 0.9

@@ -271,7 +271,7 @@ def test_click_on_a_mirror_shows_its_poses_and_exclusions(
     wait(window, lambda: view.history is not None)
     assert "H01" in view.headline.text()
     rows = [[view.excluded.item(i, j).text() for j in range(3)] for i in range(view.excluded.rowCount())]
-    assert ["T4", "carrier not found above the noise", "9 of 9"] in rows
+    assert ["T4", "carrier not found above the noise", "9 of 9 receiver-frames"] in rows
     assert np.isfinite(view.history.ellipse_mrad).all()
     for key in ("error", "sigma", "status", "transmitters"):
         assert view.choose_colour(key)

@@ -14,6 +14,8 @@ from rfpose.dsp import CalibrationStatus, LineStatus
 from rfpose.errors import RfposeError
 from rfpose.geometry import rot_enu_from_mirror, unit
 from rfpose.multilat import FixStatus, PoseStatus, RangeStatus
+from rfpose.multilat.integrity import TransmitterStatus
+from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.result_file import Result, frame_time
 from rfpose.scenario import Scenario
@@ -86,12 +88,13 @@ class FieldPicture:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exclusion:
-    """A transmitter that had no full part in a mirror's pose: why, and in how many receiver-frames."""
+    """A transmitter (or what else a pose rests on) that had no full part in it: why, and how often."""
 
     transmitter_id: str
     reason: str
     count: int
     total: int
+    unit: str = "receiver-frames"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,6 +120,8 @@ class History:
     fix_reasons
         What kept receivers from being located, with counts.
     exclusions
+    protection_level_mrad : (frame,)
+        The normal is off by more, unnoticed, as rarely as the scenario asks; NaN where nobody tested.
     """
 
     time_s: FloatArray
@@ -131,6 +136,7 @@ class History:
     status: tuple[str, ...]
     fix_reasons: dict[str, int]
     exclusions: tuple[Exclusion, ...]
+    protection_level_mrad: FloatArray
 
 
 def field_of_scenario(scenario: Scenario) -> FieldPicture:
@@ -247,7 +253,8 @@ def history(result: Result, i_heliostat: int) -> History:
             FixStatus(code).reason: n
             for code, n in Counter(int(s) for s in result.fixes.status[:, rows].ravel() if s).most_common()
         },
-        exclusions=_exclusions(result, rows),
+        exclusions=_exclusions(result, rows) + _rejections(result, i_heliostat),
+        protection_level_mrad=_protection_mrad(result, i_heliostat),
     )
 
 
@@ -287,6 +294,32 @@ def _exclusions(result: Result, rows: slice) -> tuple[Exclusion, ...]:
                 counted[RangeStatus(int(own)).reason] += 1
         found += [Exclusion(transmitter_id=name, reason=r, count=n, total=total) for r, n in counted.most_common()]
     return tuple(found)
+
+
+def _rejections(result: Result, i_heliostat: int) -> tuple[Exclusion, ...]:
+    """Which transmitters and priors the tests of the residuals threw out, and in how many frames."""
+    tests = result.integrity
+    if tests is None:
+        return ()
+    found, total = [], len(result.frame_start_index)
+    for t, name in enumerate(result.scenario.transmitter_ids):
+        counted = Counter(int(s) for s in tests.transmitter_status[:, i_heliostat, t])
+        for code, count in counted.most_common():
+            if code not in (TransmitterStatus.OK, TransmitterStatus.NOT_RECEIVED):
+                reason = TransmitterStatus(code).reason
+                found.append(Exclusion(transmitter_id=name, reason=reason, count=count, total=total, unit="frames"))
+    for prior, name in enumerate(PRIORS):
+        count = int(np.count_nonzero(tests.prior_rejected[:, i_heliostat, prior]))
+        if count:
+            reason = "contradicts the phases"
+            found.append(Exclusion(transmitter_id=name, reason=reason, count=count, total=total, unit="frames"))
+    return tuple(found)
+
+
+def _protection_mrad(result: Result, i_heliostat: int) -> FloatArray:
+    if result.integrity is None:
+        return np.full(len(result.frame_start_index), np.nan)
+    return np.asarray(1e3 * result.integrity.protection_level_rad[:, i_heliostat])
 
 
 def project(point_enu_m: FloatArray, azimuth_rad: float, elevation_rad: float) -> FloatArray:

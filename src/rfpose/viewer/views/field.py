@@ -154,7 +154,7 @@ class FieldView(View):
         )
         self.residual_plot.addItem(self.residual_bars)
         self.residual_plot.addItem(self.residual_sigma)
-        self.excluded = Table(("transmitter", "why it had no full part", "receiver-frames"))
+        self.excluded = Table(("transmitter", "why it had no full part", "how often"))
         self.tabs = QTabWidget()
         self.tabs.addTab(graphs, "Pose over frames")
         self.tabs.addTab(residual, "Residuals")
@@ -334,9 +334,11 @@ class FieldView(View):
         name = document.field.heliostat_ids[now.heliostat]
         frame = min(now.frame, len(found.time_s) - 1)
         what = "measured − true normal" if found.has_truth else "measured normal − its mean"
+        level = found.protection_level_mrad[frame]
+        guarded = f", protection level {level:.3g} mrad" if np.isfinite(level) else ""
         self.headline.setText(
             f"<b>{name}</b>: azimuth {found.azimuth_deg[frame]:.4f}°, elevation {found.elevation_deg[frame]:.4f}°, "
-            f"sigma {found.sigma_mrad[frame]:.3g} mrad of the normal; {found.status[frame]}. "
+            f"sigma {found.sigma_mrad[frame]:.3g} mrad of the normal{guarded}; {found.status[frame]}. "
             f"Below: {what}, 95 % ellipse."
         )
         for k, curve in enumerate(self.offset_curves):
@@ -356,7 +358,7 @@ class FieldView(View):
             plot.vb.autoRange(padding=0.1)
         self._draw_residuals(document.field, found, frame)
         rows = [
-            [item.transmitter_id, item.reason, f"{item.count} of {item.total}"]
+            [item.transmitter_id, item.reason, f"{item.count} of {item.total} {item.unit}"]
             for item in found.exclusions[:_MAX_TABLE]
         ]
         rows += [["(receivers)", reason, str(count)] for reason, count in found.fix_reasons.items()]
