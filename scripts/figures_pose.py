@@ -292,7 +292,7 @@ def integrity(directory: Path) -> None:
         rng = np.random.default_rng(30 + k)
         z = distance + RANGE_SIGMA_M * (rng.standard_normal(distance.shape) + rng.standard_normal((n, 1, 10)))
         who = rng.integers(0, 10, n)
-        z[np.arange(n), :, who] += size * RANGE_SIGMA_M * rng.standard_normal((n, 3))
+        z[np.arange(n), :, who] += size * RANGE_SIGMA_M * rng.choice([-1.0, 1.0], (n, 3))
         raw = solve_rigid(TRANSMITTER, PLACES, z[:, None], **common)
         safe = solve_with_integrity(TRANSMITTER, PLACES, z[:, None], false_alarm=1e-3, **common)
         ruined = angle_between_rad(raw.normal_enu, rot[:, :, 2])
@@ -312,7 +312,7 @@ def integrity(directory: Path) -> None:
             f"{100 * share:.0f} %", (x, 1e3 * y), textcoords="offset points", xytext=(0, -14), ha="center", fontsize=8
         )
     axes.set(xscale="log", yscale="log", ylabel="normal [mrad]")
-    axes.set_xlabel("error of one transmitter, another at each receiver [sigma of a range]")
+    axes.set_xlabel("error of one transmitter, its sign drawn at each receiver [sigma of a range]")
     axes.set_title("One bad transmitter in ten, one clock a mirror (per cent: found)")
     axes.set_ylim(bottom=0.35e3 * min(guarded))
     axes.legend(fontsize=9)
