@@ -24,7 +24,7 @@ from rfpose.checks import FloatArray
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.field_view import FieldPicture, History, history
 from rfpose.viewer.state.session import Selection, Session
-from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme, see_through
+from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme
 from rfpose.viewer.views.parts import Plan, Scale, Table, View, plot_in, segments
 from rfpose.viewer.views.space import Space
 from rfpose.viewer.workers import Workers
@@ -118,9 +118,7 @@ class FieldView(View):
         self.headline.setWordWrap(True)
         graphs = pg.GraphicsLayoutWidget()
         self.offset_plot = plot_in(graphs, theme, x="time [s]", y=None)
-        self.offset_plot.addLegend(
-            offset=(-4, 2), labelTextSize="8pt", colCount=2, brush=pg.mkBrush(see_through(theme.plot))
-        )
+        self.offset_plot.addLegend(offset=(-4, 2), labelTextSize="8pt", colCount=2)
         self.offset_curves = [
             self.offset_plot.plot(
                 [], [], pen=pg.mkPen(colour, width=1.5), symbol="o", symbolSize=5, symbolBrush=colour, symbolPen=None,
@@ -356,6 +354,8 @@ class FieldView(View):
             self.ellipse_now.setData(1e-3 * found.ellipse_mrad[frame, :, 0], 1e-3 * found.ellipse_mrad[frame, :, 1])
         for plot in (self.offset_plot, self.ellipse_plot):
             plot.vb.autoRange(padding=0.1)
+        (low, high) = self.offset_plot.viewRange()[1]
+        self.offset_plot.setYRange(low, high + 0.2 * (high - low), padding=0.0)  # room for the key
         self._draw_residuals(document.field, found, frame)
         rows = [
             [item.transmitter_id, item.reason, f"{item.count} of {item.total} {item.unit}"]

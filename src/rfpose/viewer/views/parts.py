@@ -32,6 +32,8 @@ __all__ = ["Dots", "Plan", "Scale", "Table", "View", "keep_axes", "plot_in", "se
 _PICK_PX = 14.0
 _LEVELS = 64
 _NUMERIC = "0123456789-−+.–n"
+_CROWD = 200
+"""With more mirrors than this names get a ground of their own to be read on."""
 _MANY = 1500
 """Dots above this number are squares without rim and smoothed edges: they are drawn ten times as fast."""
 
@@ -224,6 +226,7 @@ class Plan:
         self.transmitters.setZValue(30)
         self.calibration.setZValue(30)
         self.labels: list[Any] = []
+        self._fill: QColor | None = None
 
     def show_site(self, field: FieldPicture | None) -> None:
         """Draw what stands still."""
@@ -237,6 +240,7 @@ class Plan:
         self.light_up(field, None)
         places = field.calibration_enu_m
         self.calibration.setData(places[:, 0], places[:, 1])
+        self._fill = see_through(self.theme.plot) if len(field.pivot_enu_m) > _CROWD else None
         if self._names:
             for name, place in zip(field.transmitter_ids, field.transmitter_enu_m, strict=True):
                 self._label(name, place, self.theme.warning)
@@ -256,7 +260,7 @@ class Plan:
         )
 
     def _label(self, name: str, place: FloatArray, colour: str) -> None:
-        label = pg.TextItem(name, color=colour, anchor=(-0.15, 1.05), fill=see_through(self.theme.plot))
+        label = pg.TextItem(name, color=colour, anchor=(-0.15, 1.05), fill=self._fill)
         label.setZValue(20)
         label.setPos(float(place[0]), float(place[1]))
         self.plot.addItem(label, ignoreBounds=True)

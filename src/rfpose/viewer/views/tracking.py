@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QPushButton, QSlid
 from rfpose.pipeline.track_view import TrackPicture
 from rfpose.viewer.state.playback import SPEEDS
 from rfpose.viewer.state.session import Session
-from rfpose.viewer.theme import SERIES, Theme, see_through
+from rfpose.viewer.theme import SERIES, Theme
 from rfpose.viewer.views.parts import Dots, Scale, Table, View, keep_axes, plot_in, segments
 from rfpose.viewer.workers import Workers
 
@@ -93,9 +93,7 @@ class TrackingView(View):
         self.spot_plot.addItem(self.spots)
         self.curve_plot = plot_in(self.graphs, theme, x="time, nights left out [h]", y="rms error [mrad]", row=1)
         self.curve_plot.setLogMode(y=True)
-        self.legend = self.curve_plot.addLegend(
-            offset=(-4, 2), labelTextSize="7pt", colCount=5, brush=pg.mkBrush(see_through(theme.plot))
-        )
+        self.legend = self.curve_plot.addLegend(offset=(-4, 2), labelTextSize="7pt", colCount=5)
         self.cursor_line = pg.InfiniteLine(angle=90, movable=True, pen=pg.mkPen("#E69F00", width=2))
         self.cursor_line.sigDragged.connect(lambda line: self._cursor_dragged(line))
         self.curve_plot.addItem(self.cursor_line, ignoreBounds=True)
@@ -157,7 +155,7 @@ class TrackingView(View):
             return
         low, high = np.log10(np.percentile(values, 0.5)), np.log10(values.max())
         span = max(high - low, 0.3)
-        self.curve_plot.setYRange(low - 0.05 * span, high + 0.45 * span, padding=0.0)
+        self.curve_plot.setYRange(low - 0.05 * span, high + 0.6 * span, padding=0.0)
         decades = range(int(np.floor(low)) - 1, int(np.ceil(high)) + 1)
         marks = [(np.log10(k) + d, f"{k * 10.0**d:g}") for d in decades for k in (1, 2, 5)]
         self.curve_plot.getAxis("left").setTicks([marks])
