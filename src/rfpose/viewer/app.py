@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib.util
+import logging
 import os
 import re
 import sys
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from PySide6.QtWidgets import QApplication
 
 __all__ = ["check_display", "check_installed", "make_application", "run"]
+
+_log = logging.getLogger(__name__)
 
 DEBIAN_PACKAGES = {
     "libEGL.so": "libegl1",
@@ -122,11 +125,15 @@ def make_application(*, offscreen: bool = False) -> QApplication:
     """Return the application, made if there is none yet."""
     if offscreen:
         os.environ["QT_QPA_PLATFORM"] = "offscreen"
+    from PySide6.QtCore import qInstallMessageHandler
     from PySide6.QtWidgets import QApplication
 
     from rfpose.viewer.theme import ensure_font
 
     found = QApplication.instance()
+    if found is None and offscreen:
+        # what Qt's own stand-in for a screen cannot do is no news to who asks for a picture
+        qInstallMessageHandler(lambda _kind, _context, text: _log.debug("Qt: %s", text))
     app = found if isinstance(found, QApplication) else QApplication([sys.argv[0]])
     app.setApplicationName("rfpose")
     app.setApplicationDisplayName("rfpose")
