@@ -58,6 +58,7 @@ def test_radio_beats_what_plants_do_today(default_hour):
     assert rms["radio-both"] <= 0.3
     assert rms["radio-both"] < rms["camera-model"] < rms["open-loop"]
     assert rms["drone-model"] < rms["open-loop"]
+    assert max(rms["bias"], rms["berenguel"]) < 0.95 * rms["open-loop"]
     assert rms["encoder"] == pytest.approx(rms["open-loop"], rel=0.1)  # neither knows how the pedestal stands
     lost = score(default_hour.sums("radio")).lost_frames
     n_frame = 12 * 0.68 * 900

@@ -48,7 +48,7 @@ class Drive(Record):
     """A motor waits until it is further than this from where it should be; 0: half a step."""
     worm_ratio: NonNegative = 30.0
     elevation_limits_deg: tuple[float, float] = (-5.0, 95.0)
-    azimuth_limits_deg: tuple[float, float] = (-360.0, 360.0)
+    azimuth_limits_deg: tuple[float, float] = (-540.0, 540.0)
     """From the middle of each mirror's travel on the first day."""
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from rfpose import geometry
 from rfpose.errors import InvalidInputError, ScenarioError
-from rfpose.feedback.mount import PARAMETERS, Mount, command
+from rfpose.feedback.mount import PARAMETERS
 from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking import METHODS, _kernels
 from rfpose.feedback.tracking.hidden import draw_field, field_positions
@@ -19,6 +19,7 @@ from rfpose.feedback.tracking.score import quantile
 from rfpose.feedback.tracking.timeline import days, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.layout.maps import ESTIMATORS, Estimator, mirrors_facing, noise_of, normal_map
+from rfpose.multilat.rigid import Knowledge, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -125,16 +126,15 @@ def test_hidden_mounts_scatter_as_told():
     assert month.std() == pytest.approx(0.05e-3, rel=0.05)
 
 
-def test_nominal_mounts_reach_their_aim_all_day():
+def test_azimuth_axes_have_the_middle_of_their_travel_on_the_days_course():
     scenario = load_scenario(DATA)
     field = field_of(scenario)
-    day = days(scenario)[0]
-    sun = day.sun_enu[::1800]
-    aim = np.array(scenario.site.aim_enu_m)
-    for i in range(len(field)):
-        mount = Mount(pivot_enu_m=field.pivot_enu_m[i], parameters=dict(zip(PARAMETERS, field.nominal[i], strict=True)))
-        got = command(mount, sun_enu=sun, target_enu_m=np.broadcast_to(aim, sun.shape))
-        assert np.all(got.status == 0)
+    sun = days(scenario)[0].sun_enu[::60]
+    for pivot, home in zip(field.pivot_enu_m, field.constant[:, 15], strict=True):
+        normal = geometry.bisector_enu(np.array(scenario.site.aim_enu_m) - pivot, sun)
+        azimuth = np.unwrap(geometry.azimuth_elevation_from_enu(normal)[0]) - home
+        azimuth -= 2.0 * np.pi * np.rint(0.5 * (azimuth.max() + azimuth.min()) / (2.0 * np.pi))
+        assert azimuth.max() == pytest.approx(-azimuth.min(), abs=0.02)
 
 
 def test_mirrors_to_track():
@@ -202,6 +202,33 @@ def test_radio_errors_are_the_estimators_bound():
     worse = tones.errors(mirrors.normal_enu, np.random.default_rng(0)).sigma_rad
     assert np.all(worse > 100.0 * errors.sigma_rad)
     assert "shared-clock" in ESTIMATORS
+
+
+def test_radio_noise_lies_as_the_pose_has_it():
+    # two receivers close together see turns about their line badly: right and up differ, and go together
+    scenario = changed(radio={"ground": "none"})
+    places = ((0.9, 0.1, 0.0), (-0.5, 0.4, 0.0), (-0.4, -0.3, 0.0))
+    mirrors = tuple(h.model_copy(update={"receiver_mirror_m": places, "arm_m": 0.0}) for h in scenario.heliostat)
+    scenario = scenario.model_copy(update={"heliostat": mirrors})
+    normal = geometry.unit(np.array([0.0, 0.0, 50.0]) - scenario.pivot_enu_m + [10.0, 40.0, 60.0])
+    rot = geometry.rot_enu_from_mirror(normal)
+    spread = radio_model(scenario, normal).errors(normal, np.random.default_rng(0)).spread_rad
+    noise = noise_of(scenario)
+    sigma = np.concatenate([noise.tone_sigma_m, noise.carrier_sigma_m[None]])[:, None, :]
+    cov = rigid_bound(
+        scenario.transmitter_enu_m, places, scenario.pivot_enu_m, rot,
+        sigma_m=np.broadcast_to(sigma, (12, 3, 3, 10)),
+        transmitter_sigma_m=np.concatenate([noise.calibration_sigma_m, np.full((1, 10), np.inf)]),
+        clock_class=[0, 1, 2],
+        knowledge=Knowledge(clock_sigma_m=0.0, pivot_enu_m=scenario.pivot_enu_m, pivot_sigma_m=5e-3),
+    )[:, 3:, 3:]  # fmt: skip
+    for m in range(12):
+        cross = np.cross(np.eye(3), normal[m])  # rows: e_i × n
+        of_normal = cross.T @ cov[m] @ cross
+        axes = rot[m][:, :2]
+        lower = np.array([[spread[m, 0], 0.0], [spread[m, 1], spread[m, 2]]])
+        np.testing.assert_allclose(lower @ lower.T, axes.T @ of_normal @ axes, rtol=1e-6, atol=1e-16)
+    assert np.all(np.abs(np.log(spread[:, 2] / spread[:, 0])) > 0.2)
 
 
 def test_hidden_transmitters_cost_accuracy_and_at_last_the_pose():
