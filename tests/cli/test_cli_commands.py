@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 
 from rfpose.cli._app import app
 from rfpose.cli.convert import FORMAT_NAMES
+from rfpose.cli.demo import write_report
 from rfpose.pipeline.demo import run_demo, shipped_scenario
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
@@ -195,9 +196,17 @@ def test_demo_on_a_small_field(directory: Path, tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "demo").iterdir()} == names
 
 
-def test_demo_refuses_what_is_there_before_any_work(tmp_path: Path) -> None:
-    (tmp_path / "spectrum.png").write_text("dear")
+def test_demo_writes_a_report(directory: Path, tmp_path: Path) -> None:
+    assert write_report(directory / "result.h5", tmp_path / "report.html") == {"report": tmp_path / "report.html"}
+    report = (tmp_path / "report.html").read_text()
+    assert "H01" in report
+    assert "data:image/png;base64" in report
+
+
+@pytest.mark.parametrize("name", ["spectrum.png", "report.html"])
+def test_demo_refuses_what_is_there_before_any_work(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("dear")
     shown = _run("demo", "-o", tmp_path)
     assert shown.exit_code == 3
-    assert "spectrum.png: exists already" in shown.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["spectrum.png"]
+    assert f"{name}: exists already" in shown.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -8,8 +8,9 @@ import click
 
 from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
 from rfpose.cli.evaluate import show_evaluation
+from rfpose.errors import RfposeError
 
-__all__ = ["command"]
+__all__ = ["command", "write_report"]
 
 
 @click.command(name="demo", epilog=examples("rfpose demo", "rfpose demo -o field --seed 3 --json"))
@@ -25,21 +26,40 @@ __all__ = ["command"]
 @force_option
 @common_options
 def command(output: Path, seed: int, force: bool) -> None:
-    """Simulate a field of 12 heliostats, process the recording, evaluate it and draw it."""
+    """Simulate a field of 12 heliostats, process the recording, evaluate it, draw it and write a report."""
     from rfpose.pipeline.demo import run_demo
+    from rfpose.pipeline.files import refuse_existing
 
+    report = output / "report.html"
+    refuse_existing(report, force=force)
     with progress("Preparing") as shown:
         outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage)
+        shown.stage("Writing the report")
+        files = outcome.files | write_report(Path(outcome.files["result"]), report)
     if wants_json():
         emit_json(
             {
                 **outcome.evaluation.as_dict(),
                 "independent": outcome.independent.as_dict(),
-                "files": outcome.files,
+                "files": files,
             }
         )
         return
     show_evaluation(outcome.independent, title="Each receiver located on its own, as published")
     show_evaluation(outcome.evaluation, title="All phases of a mirror at once, carrier included")
-    for what, path in outcome.files.items():
+    for what, path in files.items():
         say(f"{what.replace('_', ' ')}: {path}")
+
+
+def write_report(result: Path, report: Path) -> dict[str, Path]:
+    """Write the report where the viewer can be used, and say what it lacks where not."""
+    from rfpose.viewer.app import check_installed
+    from rfpose.viewer.export import export
+
+    try:
+        check_installed()
+        export(result, report)
+    except RfposeError as error:
+        click.echo(f"no report: {error}", err=True)
+        return {}
+    return {"report": report}
