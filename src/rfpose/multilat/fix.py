@@ -40,6 +40,7 @@ class FixStatus(IntEnum):
     NOT_CONVERGED = _kernels.NOT_CONVERGED
     WEAK_GEOMETRY = 5
     RESIDUAL = 6
+    UNCALIBRATED = 7
 
     @property
     def reason(self) -> str:
@@ -54,6 +55,7 @@ _REASON = {
     FixStatus.SINGULAR: "the transmitters received and the receiver lie in one plane or on one line",
     FixStatus.NOT_CONVERGED: "the iteration did not converge from any start",
     FixStatus.WEAK_GEOMETRY: "dilution of precision above the limit",
+    FixStatus.UNCALIBRATED: "no calibration receiver: ranges are not known, only differences between receivers",
     FixStatus.RESIDUAL: "residuals far above what the sigma of the ranges allows (a reflection, a blocked path?)",
 }
 

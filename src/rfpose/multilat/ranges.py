@@ -30,6 +30,7 @@ class RangeStatus(IntEnum):
     NOT_RECEIVED = 1
     AMBIGUOUS = 2
     TONE_FLOAT = 3
+    UNCALIBRATED = 4
 
     @property
     def reason(self) -> str:
@@ -42,6 +43,7 @@ _REASON = {
     RangeStatus.NOT_RECEIVED: "transmitter not received",
     RangeStatus.AMBIGUOUS: "farther from the reference than half the longest wavelength: whole wavelengths unknown",
     RangeStatus.TONE_FLOAT: "a shorter tone was left out: the longer ones are too noisy to count its wavelengths",
+    RangeStatus.UNCALIBRATED: "no calibration receiver: the transmitter's own phase is not known",
 }
 
 

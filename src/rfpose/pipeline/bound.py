@@ -14,7 +14,14 @@ from rfpose.multilat.ground import ground_bound
 from rfpose.multilat.rigid import full_covariance, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice, reflectors_of
-from rfpose.pipeline.mirrors import MirrorGroup, calibration_share, carrier_rf_hz, group_hz, mirror_groups
+from rfpose.pipeline.mirrors import (
+    MirrorGroup,
+    calibration_share,
+    carrier_rf_hz,
+    group_hz,
+    is_calibrated,
+    mirror_groups,
+)
 from rfpose.pipeline.noise import PhaseNoise
 from rfpose.scenario import Scenario
 
@@ -146,7 +153,10 @@ def _range_noise(scenario: Scenario, noise: PhaseNoise, group: MirrorGroup) -> t
     for q in np.argsort(-scenario.wavelength_m):
         to_m = scenario.wavelength_m[q] / (2.0 * np.pi)
         sigma.append(to_m * noise.tone_rad[..., q][:, group.rows].reshape(n, group.rows.shape[1], -1))
-        common.append(to_m * np.repeat(noise.calibration_rad[..., q], len(group.column), axis=0))
+        if is_calibrated(scenario):
+            common.append(to_m * np.repeat(noise.calibration_rad[..., q], len(group.column), axis=0))
+        else:
+            common.append(np.full((n, len(scenario.transmitter)), np.inf))
     if group.uses_carrier:
         to_m = scenario.radio.propagation_speed_mps / carrier_rf_hz(scenario) / (2.0 * np.pi)
         sigma.append(to_m * noise.carrier_rad[:, group.rows].reshape(n, group.rows.shape[1], -1))

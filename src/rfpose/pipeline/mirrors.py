@@ -16,7 +16,15 @@ from rfpose.multilat.rigid import Knowledge
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.scenario import Heliostat, Scenario
 
-__all__ = ["MirrorGroup", "calibration_share", "carrier_rf_hz", "group_hz", "mirror_groups", "observations"]
+__all__ = [
+    "MirrorGroup",
+    "calibration_share",
+    "carrier_rf_hz",
+    "group_hz",
+    "is_calibrated",
+    "mirror_groups",
+    "observations",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,6 +104,11 @@ def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
         )
 
 
+def is_calibrated(scenario: Scenario) -> bool:
+    """Whether the transmitters' electronic phases are measured; if not, receivers of a mirror are compared."""
+    return bool(scenario.calibration_receiver)
+
+
 def carrier_rf_hz(scenario: Scenario) -> FloatArray:
     """(transmitter,) carrier frequencies at RF [Hz]."""
     return np.asarray(scenario.radio.centre_frequency_hz + scenario.carrier_hz)
@@ -110,7 +123,10 @@ def group_hz(scenario: Scenario, group: MirrorGroup) -> FloatArray:
 def observations(
     tones: TonePhases, calibration: Calibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
 ) -> list[Observation]:
-    """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat."""
+    """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat.
+
+    Without calibration receivers the transmitters' own phases stay in, unknown: only differences between receivers tell.
+    """
     n_frame, n_helio = len(tones.frame_start_index), len(group.column)
     n_receiver, n_transmitter = group.rows.shape[1], len(scenario.transmitter)
 
@@ -121,12 +137,17 @@ def observations(
     for k, q in enumerate(np.argsort(-scenario.wavelength_m)):
         wavelength = float(scenario.wavelength_m[q])
         to_m = wavelength / (2.0 * np.pi)
-        z = of_mirrors(-to_m * (tones.phase_rad[..., q] - calibration.phase_rad[:, None, :, q]))
-        if k == 0:
+        electronic = calibration.phase_rad[:, None, :, q] if is_calibrated(scenario) else 0.0
+        z = of_mirrors(-to_m * (tones.phase_rad[..., q] - electronic))
+        if k == 0 and not is_calibrated(scenario):
+            z = _coarse_uncalibrated(z, wavelength)
+        elif k == 0:
             z = _coarse(
                 z, of_mirrors(ranges.range_difference_m), of_mirrors(ranges.reference.astype(np.float64)), wavelength
             )
-        per_frame = to_m * np.repeat(calibration.sigma_rad[..., q], n_helio, axis=0)
+        per_frame = np.full((n_frame * n_helio, n_transmitter), np.inf)
+        if is_calibrated(scenario):
+            per_frame = to_m * np.repeat(calibration.sigma_rad[..., q], n_helio, axis=0)
         out.append(
             Observation(
                 range_m=z,
@@ -167,6 +188,23 @@ def _coarse(z: FloatArray, difference_m: FloatArray, reference: FloatArray, wave
     base = base - wavelength * np.rint((base - first) / wavelength)
     expected = base + difference_m
     return z + wavelength * np.rint((expected - z) / wavelength)
+
+
+def _coarse_uncalibrated(z: FloatArray, wavelength: float) -> FloatArray:
+    """Give the coarsest tone's ranges whole wavelengths that bring a mirror's receivers together.
+
+    Receivers lie within a fraction of the wavelength of each other, up to their clocks, which may be anything. Which
+    branch a transmitter's ranges are on does not matter: its own phase is unknown.
+    """
+    turn = 2.0 * np.pi / wavelength
+    seen = np.isfinite(z)
+    phasor = np.where(seen, np.exp(1j * turn * np.nan_to_num(z)), 0.0)
+    most = np.argmax(seen.sum(axis=2), axis=1)[:, None, None]
+    reference = np.take_along_axis(phasor, most, axis=1)
+    clock = np.angle((phasor * reference.conj()).sum(axis=2, keepdims=True)) / turn
+    common = np.angle((phasor * np.exp(-1j * turn * clock)).sum(axis=1, keepdims=True)) / turn
+    left = z - clock - common
+    return np.asarray(left - wavelength * np.rint(left / wavelength) + common + clock)
 
 
 def calibration_share(sigma_rad: FloatArray, scenario: Scenario) -> FloatArray:

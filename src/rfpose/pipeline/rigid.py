@@ -20,8 +20,16 @@ from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, Transmitter
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, full_covariance, solve_rigid
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import Observation, align_points, solve_ladder
+from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import PoseChoice, reflectors_of
-from rfpose.pipeline.mirrors import MirrorGroup, calibration_share, carrier_rf_hz, mirror_groups, observations
+from rfpose.pipeline.mirrors import (
+    MirrorGroup,
+    calibration_share,
+    carrier_rf_hz,
+    is_calibrated,
+    mirror_groups,
+    observations,
+)
 from rfpose.pipeline.result_file import DelayTable, FixTable, IntegrityTable, PoseTable, ReflectionTable
 from rfpose.scenario import Scenario
 
@@ -189,6 +197,16 @@ def _inputs(stages: _Stages, group: MirrorGroup) -> tuple[FloatArray, FloatArray
     located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
     start, rot = align_points(places, located)
     phases = observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group)
+    if not is_calibrated(stages.scenario):
+        start = np.tile(group.pivot_enu_m, (n_frame, 1))
+        rot = rotations_from_differences(
+            stages.scenario.transmitter_enu_m,
+            places,
+            start,
+            phases[0].range_m,
+            sigma_m=phases[0].sigma_m,
+            clock_sigma_m=group.knowledge(stages.scenario, n_frame).clock_sigma_m,
+        )
     return places, start, rot, phases
 
 

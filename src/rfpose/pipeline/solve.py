@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
+import numpy.typing as npt
 
-from rfpose.dsp import Calibration, TonePhases, calibrate
-from rfpose.errors import ScenarioError
-from rfpose.multilat import Fixes, Poses, RangeDifferences, check_unambiguous, range_differences, solve_poses
+from rfpose.checks import read_only
+from rfpose.dsp import Calibration, CalibrationStatus, TonePhases, calibrate
+from rfpose.errors import GeometryError, ScenarioError
+from rfpose.multilat import (
+    Fixes,
+    FixStatus,
+    Poses,
+    RangeDifferences,
+    RangeStatus,
+    check_unambiguous,
+    range_differences,
+    solve_poses,
+)
 from rfpose.multilat.fix import check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
+from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.result_file import FixTable, PoseTable, Result
 from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
@@ -36,22 +49,53 @@ def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None =
     InvalidInputError
         Unknown ``pose``.
     ScenarioError
-        No heliostat, or no calibration receiver.
+        No heliostat; or no calibration receiver where one is needed: by pose ``independent``, by mirrors whose
+        pivot is not surveyed, and by reflections.
     GeometryError
-        Too few transmitters, on a line or at the same place; or the field is too wide for the longest tone; or
-        something stands behind a plane that is to reflect it.
+        Too few transmitters, on a line or at the same place; or the field (without calibration receivers: a mirror)
+        is too wide for the longest tone; or something stands behind a plane that is to reflect it.
     """
     chosen = choose(scenario, pose=pose) if choice is None else choice
     if not scenario.heliostat:
         raise ScenarioError(f"scenario `{scenario.name}` has no heliostat to measure; add a [[heliostat]]")
-    if not scenario.calibration_receiver:
-        raise ScenarioError(
-            f"scenario `{scenario.name}` has no calibration receiver, and pose `{pose}` needs one to learn the "
-            "transmitters' electronic phases; add a [[calibration_receiver]] at a surveyed place"
-        )
     check_transmitters(scenario.transmitter_enu_m)
-    check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
+    if is_calibrated(scenario):
+        check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
+    else:
+        _check_solvable_by_differences(scenario, chosen)
     check_reflectors(scenario, reflectors_of(scenario, chosen.reflection))
+
+
+def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> None:
+    """Refuse what cannot do without calibration receivers."""
+    if choice.pose != "rigid":
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no calibration receiver, and pose `{choice.pose}` needs one to learn the "
+            "transmitters' electronic phases; add a [[calibration_receiver]] at a surveyed place, or survey the "
+            "pivots (`pivot_sigma_m`) and use pose `rigid`"
+        )
+    if choice.reflection != "none":
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no calibration receiver, and reflections cannot be told from what the "
+            "transmitters' phases do without one; add a [[calibration_receiver]] at a surveyed place, or leave "
+            "reflections out (`--reflection ignore`)"
+        )
+    longest = float(np.max(scenario.wavelength_m))
+    for heliostat in scenario.heliostat:
+        if heliostat.pivot_sigma_m is None:
+            raise ScenarioError(
+                f"scenario `{scenario.name}` has no calibration receiver, and the pivot of heliostat "
+                f"`{heliostat.id}` is not surveyed: nothing tells where it is; add a [[calibration_receiver]] at a "
+                "surveyed place, or give `pivot_sigma_m`"
+            )
+        places = np.array(heliostat.receiver_mirror_m)
+        width = float(np.max(np.linalg.norm(places[:, None] - places, axis=-1)))
+        if width >= longest / 4.0:
+            raise GeometryError(
+                f"ambiguous: receivers of heliostat `{heliostat.id}` are {width:.3g} m apart, and without calibration "
+                f"receivers that must be below a quarter of the longest tone's wavelength of {longest:.6g} m; add a "
+                f"tone of wavelength above {4.0 * width:.6g} m"
+            )
 
 
 def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str], truth: Truth | None = None) -> Result:
@@ -76,8 +120,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     """
     choice = PoseChoice.of(settings, scenario)
     check_solvable(scenario, pose=settings["pose"], choice=choice)
-    calibration = calibrate(tones, scenario)
-    ranges = _ranges(tones, calibration, scenario)
+    calibration = calibrate(tones, scenario) if is_calibrated(scenario) else _no_calibration(tones)
+    ranges = _ranges(tones, calibration, scenario) if is_calibrated(scenario) else _no_ranges(tones)
     poses = solve_poses(
         scenario.transmitter_enu_m,
         ranges.range_difference_m,
@@ -88,6 +132,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     )
     n_frame, n_receiver = tones.phase_rad.shape[:2]
     fixes = _fix_table(poses.fixes, n_frame, n_receiver)
+    if not is_calibrated(scenario):
+        fixes = replace(fixes, status=np.where(_received(tones).any(axis=2), FixStatus.UNCALIBRATED, fixes.status))
     independent = _pose_table(poses)
     rigid = None
     if choice.pose == "rigid":
@@ -114,6 +160,35 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         reflection=None if rigid is None else rigid.reflection,
         delays=None if rigid is None else rigid.delays,
         truth=truth,
+    )
+
+
+def _received(tones: TonePhases) -> npt.NDArray[np.bool_]:
+    """(frame, receiver, transmitter) whether any tone has a phase."""
+    return np.asarray(np.isfinite(tones.phase_rad).any(axis=3))
+
+
+def _no_calibration(tones: TonePhases) -> Calibration:
+    n_frame, _, n_transmitter, n_tone = tones.phase_rad.shape
+    unknown = read_only(np.full((n_frame, n_transmitter, n_tone), np.nan))
+    return Calibration(
+        phase_rad=unknown,
+        sigma_rad=unknown,
+        drift_rad_per_sqrt_s=read_only(np.full(n_tone, np.nan)),
+        status=read_only(np.full((n_frame, n_transmitter), CalibrationStatus.MISSING, np.uint8)),
+    )
+
+
+def _no_ranges(tones: TonePhases) -> RangeDifferences:
+    received = _received(tones)
+    unknown = read_only(np.full(received.shape, np.nan))
+    status = np.where(received, RangeStatus.UNCALIBRATED, RangeStatus.NOT_RECEIVED).astype(np.int8)
+    return RangeDifferences(
+        range_difference_m=unknown,
+        sigma_m=unknown,
+        calibration_sigma_m=unknown,
+        reference=read_only(np.full(received.shape[:2], -1, np.int64)),
+        status=read_only(status),
     )
 
 

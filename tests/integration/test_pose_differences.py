@@ -1,0 +1,151 @@
+"""IQ to normal without calibration receivers: differences between the receivers of a mirror with a surveyed pivot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rfpose.dsp import CalibrationStatus
+from rfpose.errors import GeometryError, ScenarioError
+from rfpose.multilat import FixStatus, RangeStatus
+from rfpose.multilat.rigid.start import rotations_from_differences
+from rfpose.pipeline.choice import choose
+from rfpose.pipeline.evaluate import Evaluation, evaluate
+from rfpose.pipeline.process import process
+from rfpose.pipeline.result_file import Result
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.solve import check_solvable
+from rfpose.scenario import Scenario, load_scenario
+
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
+N_FRAME = 25
+DRIFT_RAD = 0.1
+"""In the hour that the frames are spread over."""
+
+
+def site(mirror: dict[str, Any], *, drift_rad: float = DRIFT_RAD, calibration: bool = True) -> Scenario:
+    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
+    data["heliostat"] = [{**h, "pivot_sigma_m": 0.005, **mirror} for h in data["heliostat"][:4]]
+    data["radio"] |= {"frame_samples": 4000, "clock_search_ppm": 2.0}
+    if not calibration:
+        data["calibration_receiver"] = []
+    data["simulation"] |= {
+        "frame_count": N_FRAME,
+        "frame_interval_s": 3600.0 / N_FRAME,
+        "tone_snr_db": 60.0,
+        "sun_azimuth_deg": 170.0,
+        "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,
+    }
+    return Scenario.model_validate(data)
+
+
+def solved(directory: Path, mirror: dict[str, Any], *, drift_rad: float) -> Result:
+    (directory / "site.toml").write_text(site(mirror, drift_rad=drift_rad, calibration=False).to_toml())
+    simulate_recording(directory / "site.toml", directory / "rec.h5", seed=5, force=True)
+    return process(directory / "rec.h5", directory / "r.h5", estimator="correlator", force=True)
+
+
+CLOCKS = {"one clock": {"receiver_delay_sigma_s": 0.0}, "three clocks": {"carrier_phase": False}}
+
+
+@pytest.fixture(scope="module", params=CLOCKS)
+def found(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Evaluation]:
+    result = solved(tmp_path_factory.mktemp("bare"), CLOCKS[request.param], drift_rad=10.0)
+    return result, evaluate(result)
+
+
+def test_normals_are_at_the_bound_whatever_the_transmitters_do(found: tuple[Result, Evaluation]) -> None:
+    _, evaluation = found
+    assert evaluation.failed == 0
+    # the rms of that many pairs of angles is known to 1/√(4 n)
+    spread = 4.0 / np.sqrt(4.0 * 4 * N_FRAME)
+    assert abs(evaluation.ratio_to_bound - 1.0) < spread
+    assert evaluation.sigma_mrad == pytest.approx(evaluation.bound_mrad, rel=0.05)
+
+
+def test_what_is_not_known_says_so(found: tuple[Result, Evaluation]) -> None:
+    result, evaluation = found
+    assert np.all(result.fixes.status == FixStatus.UNCALIBRATED)
+    assert np.all(result.ranges.status == RangeStatus.UNCALIBRATED)
+    assert np.all(result.calibration.status == CalibrationStatus.MISSING)
+    assert np.isnan(evaluation.position_error_m.rms)
+    # a mirror is where its pivot was surveyed
+    pivot = result.scenario.pivot_enu_m
+    assert np.abs(result.poses.centre_enu_m - pivot).max() < 0.5
+
+
+def test_calibration_receivers_of_a_recording_can_be_left_alone(tmp_path: Path) -> None:
+    mirror = CLOCKS["one clock"]
+    (tmp_path / "site.toml").write_text(site(mirror).to_toml())
+    (tmp_path / "bare.toml").write_text(site(mirror, calibration=False).to_toml())
+    simulate_recording(tmp_path / "site.toml", tmp_path / "rec.h5", seed=5)
+    both = [
+        evaluate(process(tmp_path / "rec.h5", tmp_path / f"{name}.h5", estimator="correlator", scenario_path=path))
+        for name, path in (("with", None), ("without", tmp_path / "bare.toml"))
+    ]
+    assert [e.failed for e in both] == [0, 0]
+    assert both[1].normal_error_mrad.rms == pytest.approx(both[0].normal_error_mrad.rms, rel=0.02)
+
+
+def _not_surveyed(data: dict[str, Any]) -> None:
+    del data["heliostat"][1]["pivot_sigma_m"]
+
+
+def _reflecting(data: dict[str, Any]) -> None:
+    data["reflection"] = {"model": "estimate"}
+
+
+def _short_tone(data: dict[str, Any]) -> None:
+    data["tone"][0]["frequency_hz"] = 60e6
+
+
+@pytest.mark.parametrize(
+    ("pose", "change", "error", "message"),
+    [
+        ("independent", None, ScenarioError, "no calibration receiver, and pose `independent`.*pivot_sigma_m"),
+        ("rigid", _not_surveyed, ScenarioError, "no calibration receiver.*`H02`.*not surveyed.*pivot_sigma_m"),
+        ("rigid", _reflecting, ScenarioError, "no calibration receiver, and reflections.*--reflection ignore"),
+        ("rigid", _short_tone, GeometryError, "ambiguous.*quarter.*add a tone"),
+    ],
+)
+def test_what_cannot_do_without_calibration_is_refused(
+    pose: str, change: Any, error: type[Exception], message: str
+) -> None:
+    data = site({}, calibration=False).model_dump(exclude_none=True)
+    if change is not None:
+        change(data)
+        data["radio"]["sample_rate_hz"] = 400e6
+    with pytest.raises(error, match=message):
+        scenario = Scenario.model_validate(data)
+        check_solvable(scenario, pose=pose, choice=choose(scenario, pose=pose))
+
+
+@pytest.mark.parametrize("clock_sigma_m", [0.0, np.inf])
+def test_the_start_finds_any_orientation(clock_sigma_m: float) -> None:
+    rng = np.random.default_rng(4)
+    n = 200
+    transmitter = load_scenario(SHIPPED).transmitter_enu_m
+    places = np.array([[1.0, 0.0, 0.3], [-0.5, 0.9, 0.3], [-0.5, -0.9, 0.3]])
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))[:, None, None]
+    pivot = np.column_stack([rng.uniform(-60, 60, (n, 2)), rng.uniform(2, 4, n)])
+    receiver = pivot[:, None] + np.einsum("mab,rb->mra", turn, places)
+    z = np.linalg.norm(receiver[:, :, None] - transmitter, axis=-1) + 1e3 * rng.normal(size=(n, 1, len(transmitter)))
+    if clock_sigma_m > 0.0:
+        z += 100.0 * rng.normal(size=(n, 3, 1))
+    z[:, 1, 2] = np.nan
+    found = rotations_from_differences(
+        transmitter,
+        np.tile(places, (n, 1, 1)),
+        pivot,
+        z,
+        sigma_m=np.full(z.shape, 1e-3),
+        clock_sigma_m=clock_sigma_m,
+    )
+    angle = np.arccos(np.clip((np.einsum("mab,mab->m", found, turn) - 1.0) / 2.0, -1.0, 1.0))
+    # parallax is left out: a start, good to a few degrees
+    assert np.median(angle) < 0.1
+    assert np.mean(angle < 0.5) > 0.97
