@@ -12,11 +12,15 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from PySide6.QtCore import QRect
 from PySide6.QtGui import QImage
 
 from rfpose.cli import _app
 from rfpose.cli import view as command
-from rfpose.errors import InvalidInputError, RfposeError
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError
+from rfpose.recording import open_recording
+from rfpose.recording.conversion import convert
+from rfpose.recording.native import NativeRecording
 from rfpose.viewer import app, export
 
 
@@ -50,6 +54,34 @@ def test_svg_holds_text_that_can_be_read(qapp, files: dict[str, Path], tmp_path:
     texts = "".join(ET.parse(out).getroot().itertext())
     for word in ("T10", "north [m]", "H02", "2 of 3"):
         assert word in texts
+
+
+@pytest.mark.parametrize("format", ["digital-rf", "sigmf"])
+def test_other_formats_are_drawn(qapp, files: dict[str, Path], tmp_path: Path, format: str) -> None:
+    pytest.importorskip({"digital-rf": "digital_rf", "sigmf": "sigmf"}[format])
+    with open_recording(files["recording"]) as recording:
+        convert(recording, tmp_path / "rec", format=format)
+    out = tmp_path / "out.png"
+    done = run(tmp_path / "rec", "--save", out, "--size", 900, 600)
+    assert done.exit_code == 0, done.output
+    native = tmp_path / "native.png"
+    run(files["recording"], "--save", native, "--size", 900, 600)
+    pictures = [QImage(str(path)).convertToFormat(QImage.Format.Format_RGB32) for path in (out, native)]
+    spectrum = QRect(60, 60, 300, 150)
+    assert pictures[0].copy(spectrum) == pictures[1].copy(spectrum)
+
+
+def test_damage_found_while_drawing_is_an_error_and_no_picture(
+    qapp, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise RecordingError("rec.h5: cannot read sample 5; check the disk")
+
+    monkeypatch.setattr(NativeRecording, "_read_segment", broken)
+    done = run(files["recording"], "--save", tmp_path / "a.png", "--size", 900, 600)
+    assert done.exit_code == 3
+    assert "cannot read sample 5" in done.stderr
+    assert not (tmp_path / "a.png").exists()
 
 
 def test_report_is_one_file_with_pictures_tables_settings_and_versions(

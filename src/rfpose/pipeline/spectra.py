@@ -205,7 +205,7 @@ class SharedRecording(Recording):
     def _load_segments(self, receiver_id: str) -> IndexArray:
         with self._lock:
             self._refuse_closed()
-            return self._inner._load_segments(receiver_id)
+            return self._inner._segments_of(receiver_id)  # which also remembers them, for its own reading
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         with self._lock:

@@ -171,6 +171,7 @@ def export(
         if output.suffix == ".html":
             from rfpose.viewer.report import report_html
 
+            refuse_errors(window)
             write_atomically(output, report_html(app, window).encode())
             return "report"
         if view is not None:
@@ -179,11 +180,19 @@ def export(
                 raise InvalidInputError(f"{path}: view `{view}` has nothing to show for this file")
             window.go_to(view)
         settle(app, window)
+        refuse_errors(window)
         save_widget(window.views[window.current()], output)
         return window.current()
     finally:
         window.close()
         app.processEvents()
+
+
+def refuse_errors(window: MainWindow) -> None:
+    """Raise what a window would say, instead of a picture with something missing."""
+    message = window.session.message
+    if message is not None and message.is_error:
+        raise RfposeError(message.text)
 
 
 def _select(window: MainWindow, *, heliostat: str | None, transmitter: str | None, frame: int) -> None:
