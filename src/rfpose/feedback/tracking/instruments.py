@@ -63,6 +63,8 @@ class _Look:
     centre_enu_m: FloatArray
     sun_enu: FloatArray
     """(look, xyz)"""
+    heat: FloatArray
+    """(look,) as `Day.heat`"""
 
     def at_turns(self, turn_of: npt.NDArray[np.int64]) -> _Look:
         """Return one look a mirror; its sun is no longer the same for all and left out."""
@@ -72,6 +74,7 @@ class _Look:
             normal_enu=self.normal_enu[row, turn_of][:, None],
             centre_enu_m=self.centre_enu_m[row, turn_of][:, None],
             sun_enu=np.empty((0, 3)),
+            heat=np.empty(0),
         )
 
     def axes(self) -> tuple[FloatArray, FloatArray]:
@@ -169,9 +172,9 @@ class Workshop:
             p[:, :2] += field.lean_rad * heat[j]
             out = _kernels.posture_batch(p, field.constant, (count + slack * per_rad)[:, j : j + 1].copy(), 0.0)
             normal[:, j], centre[:, j] = out[:, 0, 2:5], out[:, 0, 5:]
-        look = _Look(count=count, normal_enu=normal, centre_enu_m=centre, sun_enu=sun)
+        look = _Look(count=count, normal_enu=normal, centre_enu_m=centre, sun_enu=sun, heat=heat)
         bent = look.tilted(self._gusts.bend_rad(self._gusts.draw(rng, (n, m))))
-        return _Look(count=count, normal_enu=bent, centre_enu_m=centre, sun_enu=sun)
+        return _Look(count=count, normal_enu=bent, centre_enu_m=centre, sun_enu=sun, heat=heat)
 
     def _camera_target(self) -> FloatArray:
         place = self._scenario.tracking.camera.target_enu_m
@@ -267,7 +270,8 @@ class Workshop:
                 errors = self._radio.errors(np.nan_to_num(look.normal_enu[:, j], nan=0.577), rng)
             noise = rng.standard_normal((len(plate), 2))
             spread = errors.spread_rad
-            out[:, j, 0] = plate[:, 0] + errors.bias_rad[:, 0] + spread[:, 0] * noise[:, 0]
+            drift = self._field.plate_drift_rad * look.heat[j]
+            out[:, j, 0] = plate[:, 0] + drift + errors.bias_rad[:, 0] + spread[:, 0] * noise[:, 0]
             out[:, j, 1] = plate[:, 1] + errors.bias_rad[:, 1] + spread[:, 1] * noise[:, 0] + spread[:, 2] * noise[:, 1]
             out[~errors.solved, j] = np.nan
         return out, np.maximum(errors.sigma_rad / np.sqrt(2.0), 1e-6)
