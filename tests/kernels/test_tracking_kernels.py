@@ -9,7 +9,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# a dish and a heliostat by every kind of feedback, for six minutes
+# a dish and a heliostat by every kind of feedback, for three minutes
 COURSES = """
 import sys
 import numpy as np
@@ -19,9 +19,10 @@ base = load_scenario(sys.argv[1])
 found = {}
 for collector, methods in (("heliostat", ("open-loop", "encoder", "radio-both")), ("dish", ("sun-sensor", "radio"))):
     data = base.model_dump(exclude_none=True)
-    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.1, "settle_s": 0.0, "collector": collector}
-    data["tracking"]["radio"]["outages"] = ({"first_hour": 9.07, "last_hour": 9.08},)
-    data["tracking"]["radio_model"]["points_per_day"] = 8
+    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "collector": collector}
+    data["tracking"]["radio"]["outages"] = ({"first_hour": 9.02, "last_hour": 9.035},)
+    data["tracking"]["radio"] |= {"ground": "none", "plate_calibration": "none"}
+    data["tracking"]["radio_model"] |= {"points_per_day": 8, "learn_interval_s": 20.0}
     simulation = Simulation(type(base).model_validate(data), methods=methods, count=2, seed=4)
     while simulation.done < simulation.n_segment:
         simulation.advance()
