@@ -3,8 +3,8 @@
     python benchmarks/transmitter_drift.py --frames 100
 
 The mirrors, noise and frames of `pose_chain.py`, pivots surveyed to 5 mm, frames spread over an hour. Electronic phases
-of the transmitters walk by 0, 0.1 and 1 rad in that hour. Calibrated in every frame; calibrated in the first three frames
-and held since; not calibrated, with no calibration receiver on the site at all.
+of the transmitters walk by 0, 0.1 and 1 rad in that hour. Calibrated in every frame; calibrated in the first three
+frames and held since; not calibrated, with no calibration receiver on the site at all.
 """
 
 from __future__ import annotations

@@ -48,7 +48,12 @@ def test_names_at_the_command_line_are_those_inside() -> None:
 
 def test_the_scenario_gives_the_default(recording: Path, tmp_path: Path) -> None:
     shown = _json("process", recording, "-o", tmp_path / "r.h5")
-    assert shown["choice"] == {"reflection": "none", "integrity": "on", "delays": "as the scenario says"}
+    assert shown["choice"] == {
+        "reflection": "none",
+        "integrity": "on",
+        "delays": "as the scenario says",
+        "filter": "off",
+    }
     assert shown["integrity"]["reasons"] == {}
     assert shown["integrity"]["protected"] == 4
     assert shown["integrity"]["protection_level_mrad"] > 0.0
@@ -80,9 +85,35 @@ def test_options_win_and_are_kept(recording: Path, tmp_path: Path) -> None:
     assert "protection level, median: " in text.stdout
 
 
+def test_poses_are_filtered_where_asked(recording: Path, tmp_path: Path) -> None:
+    shown = _json("process", recording, "-o", tmp_path / "r.h5", "--filter")
+    assert shown["choice"]["filter"] == "on"
+    assert sum(shown["filtered"]["reasons"].values()) == 4
+    info = _json("info", tmp_path / "r.h5")
+    assert info["settings"]["command"].endswith("--filter")
+    assert info["filtered"] == shown["filtered"]
+    evaluated = _json("evaluate", tmp_path / "r.h5")["filtered"]
+    assert (evaluated["given"], evaluated["predicted"]) == (4, 0)
+    assert evaluated["nees"] > 0.0
+    assert "filtered over frames: " in _run("evaluate", tmp_path / "r.h5").stdout
+    assert _json("process", recording, "-o", tmp_path / "n.h5", "--no-filter")["choice"]["filter"] == "off"
+    assert _json("evaluate", tmp_path / "n.h5")["filtered"] is None
+
+
+def test_how_integers_were_found_is_in_the_result(recording: Path, tmp_path: Path) -> None:
+    shown = _json("process", recording, "-o", tmp_path / "r.h5")["integers"]
+    assert all(sum(counts.values()) == 4 for counts in shown.values())
+    assert next(iter(shown.values())) == {"resolved beforehand": 4}
+
+
 def test_independent_receivers_have_no_such_choice(recording: Path, tmp_path: Path) -> None:
     refused = _run("process", recording, "-o", tmp_path / "r.h5", "--pose", "independent", "--reflection", "estimate")
     assert refused.exit_code in (2, 3)
     assert "`reflection` is of pose `rigid`" in refused.stderr
     plain = _json("process", recording, "-o", tmp_path / "p.h5", "--pose", "independent")
-    assert plain["choice"] == {"reflection": "none", "integrity": "off", "delays": "as the scenario says"}
+    assert plain["choice"] == {
+        "reflection": "none",
+        "integrity": "off",
+        "delays": "as the scenario says",
+        "filter": "off",
+    }

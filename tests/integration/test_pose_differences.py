@@ -118,8 +118,8 @@ def test_what_cannot_do_without_calibration_is_refused(
     if change is not None:
         change(data)
         data["radio"]["sample_rate_hz"] = 400e6
+    scenario = Scenario.model_validate(data)
     with pytest.raises(error, match=message):
-        scenario = Scenario.model_validate(data)
         check_solvable(scenario, pose=pose, choice=choose(scenario, pose=pose))
 
 

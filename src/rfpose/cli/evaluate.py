@@ -71,6 +71,13 @@ def show_evaluation(evaluation: Evaluation, *, title: str) -> None:
             f"protection level: median {protection.level_mrad.median:.3g} mrad of the normal; exceeded in "
             f"{protection.exceeded} of {protection.covered}, {protection.excluded} transmitters left out"
         )
+    filtered = evaluation.filtered
+    if filtered is not None:
+        say(
+            f"filtered over frames: {filtered.normal_error_mrad.rms:.3g} mrad of the normal rms, stated "
+            f"{filtered.sigma_mrad:.3g}; squared error over stated covariance {filtered.nees:.3g}; "
+            f"{filtered.predicted} of {filtered.given} mirror-frames predicted"
+        )
     say(f"mirror-frames: {evaluation.solved} solved, {evaluation.failed} failed")
     for reason, count in evaluation.failure_reasons.items():
         say(f"  {count}: {reason}")

@@ -34,6 +34,7 @@ REFLECTION_NAMES = ("estimate", "ignore")
         "rfpose process recording.h5 -o result.h5 --csv poses.csv --estimator correlator",
         "rfpose process measured/drf --scenario site.toml -o result.h5",
         "rfpose process recording.h5 -o result.h5 --reflection estimate",
+        "rfpose process recording.h5 -o result.h5 --filter",
     ),
 )
 @click.argument("recording", type=click.Path(path_type=Path))
@@ -66,6 +67,13 @@ REFLECTION_NAMES = ("estimate", "ignore")
     help="Test residuals, leave bad transmitters out, give protection levels. "
     "[default: as the scenario's [integrity] says: on]",
 )
+@click.option(
+    "--filter/--no-filter",
+    "filtered",
+    default=None,
+    help="Also filter poses over frames: mirrors turn steadily, outages are bridged. "
+    "[default: as the scenario's [motion] says: off]",
+)
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @force_option
 @common_options
@@ -79,6 +87,7 @@ def command(
     pose: str,
     reflection: str | None,
     integrity: bool | None,
+    filtered: bool | None,
     csv_path: Path | None,
     force: bool,
 ) -> None:
@@ -104,6 +113,7 @@ def command(
             pose=pose,
             reflection=reflection,
             integrity=integrity,
+            filtered=filtered,
             force=force,
             on_progress=on_progress,
         )
@@ -144,4 +154,6 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     delays = summary.get("delays", {})
     if delays.get("last_sigma_ps") is not None:
         out.append(f"receiver delays learned to {delays['last_sigma_ps']:.3g} ps, {delays['jumps']} jumps")
+    filtered = summary.get("filtered", {})
+    out.extend(f"{count} mirror-frames filtered: {reason}" for reason, count in filtered.get("reasons", {}).items())
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.multilat.ground import Reflector, Surface
 from rfpose.multilat.ground.model import heights_m
 from rfpose.scenario import Scenario
@@ -32,11 +32,14 @@ class PoseChoice:
         Model of the ground's coefficient, as in the scenario's ``[reflection]``; ``"none"``: the direct ray alone.
     integrity
         Whether residuals are tested, bad transmitters left out and protection levels given.
+    filtered
+        Whether poses are filtered over frames besides.
     """
 
     pose: str
     reflection: str
     integrity: bool
+    filtered: bool = False
 
     @classmethod
     def of(cls, settings: Mapping[str, str], scenario: Scenario) -> PoseChoice:
@@ -48,15 +51,26 @@ class PoseChoice:
             pose=default.pose,
             reflection=settings.get("reflection", default.reflection),
             integrity=settings.get("integrity", "on" if default.integrity else "off") == "on",
+            filtered=settings.get("filter", "on" if default.filtered else "off") == "on",
         )
 
     def as_settings(self) -> dict[str, str]:
         """Return the choice as text for a result file."""
-        return {"pose": self.pose, "reflection": self.reflection, "integrity": "on" if self.integrity else "off"}
+        return {
+            "pose": self.pose,
+            "reflection": self.reflection,
+            "integrity": "on" if self.integrity else "off",
+            "filter": "on" if self.filtered else "off",
+        }
 
 
 def choose(
-    scenario: Scenario, *, pose: str, reflection: str | None = None, integrity: bool | None = None
+    scenario: Scenario,
+    *,
+    pose: str,
+    reflection: str | None = None,
+    integrity: bool | None = None,
+    filtered: bool | None = None,
 ) -> PoseChoice:
     """Put together what is asked for and what the scenario says.
 
@@ -67,31 +81,51 @@ def choose(
         One of `POSES`.
     reflection
         One of `REFLECTIONS`; None: as the scenario says.
-    integrity
+    integrity, filtered
         None: as the scenario says.
 
     Raises
     ------
     InvalidInputError
         An unknown value, or one that pose ``independent`` cannot follow.
+    ScenarioError
+        A filter over poses whose delays are learned.
     """
     if pose not in POSES:
         raise InvalidInputError(f"`pose` must be one of {', '.join(POSES)}, got {pose!r}")
     if reflection is not None and reflection not in REFLECTIONS:
         raise InvalidInputError(f"`reflection` must be one of {', '.join(REFLECTIONS)}, got {reflection!r}")
     if pose != "rigid":
-        for name, asked in (("reflection", reflection == "estimate"), ("integrity", integrity is True)):
+        for name, asked in (
+            ("reflection", reflection == "estimate"),
+            ("integrity", integrity is True),
+            ("filter", filtered is True),
+        ):
             if asked:
                 raise InvalidInputError(f"`{name}` is of pose `rigid`; pose `{pose}` has no such thing: leave it away")
         return PoseChoice(pose=pose, reflection="none", integrity=False)
     model: str = scenario.reflection.model
     if reflection is not None:
         model = "estimate" if reflection == "estimate" else "none"
-    return PoseChoice(
+    chosen = PoseChoice(
         pose=pose,
         reflection=model,
         integrity=scenario.integrity.enabled if integrity is None else integrity,
+        filtered=scenario.motion.filtered if filtered is None else filtered,
     )
+    _check_filter(scenario, chosen)
+    return chosen
+
+
+def _check_filter(scenario: Scenario, choice: PoseChoice) -> None:
+    """Refuse to filter errors that frames have in common as if each frame had its own."""
+    learning = [h.id for h in scenario.heliostat if h.receiver_delay_drift_s_per_sqrt_min is not None]
+    if choice.filtered and learning:
+        raise ScenarioError(
+            f"heliostat `{learning[0]}` learns its receivers' delays over frames, and what they are off by is common "
+            "to the frames: a filter would claim more than it knows; leave the filter off (`--no-filter`), or leave "
+            "`receiver_delay_drift_s_per_sqrt_min` away"
+        )
 
 
 def reflectors_of(scenario: Scenario, model: str) -> tuple[Reflector, ...]:

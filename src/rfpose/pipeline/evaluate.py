@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.geometry import angle_between_rad, unit
-from rfpose.multilat import FixStatus, PoseStatus, position_bound
+from rfpose.multilat import FixStatus, PoseStatus, TrackStatus, position_bound
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
@@ -25,7 +25,7 @@ from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
-__all__ = ["Evaluation", "HeliostatRow", "Protection", "Statistics", "evaluate", "read_truth"]
+__all__ = ["Evaluation", "FilteredErrors", "HeliostatRow", "Protection", "Statistics", "evaluate", "read_truth"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +99,39 @@ class Protection:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FilteredErrors:
+    """How far poses filtered over frames are off, wherever the filter gives one: also where it only predicts.
+
+    Attributes
+    ----------
+    normal_error_mrad
+        Of the mirror normal.
+    sigma_mrad
+        RMS of the standard deviations that the filter states.
+    nees
+        Mean squared error over stated covariance, two angles: 1 where the covariance is true.
+    given, predicted
+        Mirror-frames with a filtered pose, and those among them that were not measured or not believed.
+    """
+
+    normal_error_mrad: Statistics
+    sigma_mrad: float
+    nees: float
+    given: int
+    predicted: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what ``rfpose evaluate --json`` prints."""
+        return {
+            "normal_error_mrad": self.normal_error_mrad.as_dict(),
+            "sigma_mrad": {"rms": self.sigma_mrad},
+            "nees": self.nees,
+            "given": self.given,
+            "predicted": self.predicted,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
     """Errors of a result against the truth; a milliradian here is of the mirror normal.
 
@@ -124,6 +157,8 @@ class Evaluation:
         One row each.
     protection
         How protection levels held; None where the result has none.
+    filtered
+        Of poses filtered over frames; None where the result has none.
     normal_error_rad, bound_rad : (frame, heliostat)
         What the figures were made of; NaN where not solved or not known.
     """
@@ -142,6 +177,7 @@ class Evaluation:
     normal_error_rad: FloatArray
     bound_rad: FloatArray
     protection: Protection | None = None
+    filtered: FilteredErrors | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``rfpose evaluate --json`` prints; its keys are a contract."""
@@ -157,6 +193,7 @@ class Evaluation:
             "failed": self.failed,
             "failure_reasons": dict(self.failure_reasons),
             "protection": None if self.protection is None else self.protection.as_dict(),
+            "filtered": None if self.filtered is None else self.filtered.as_dict(),
             "heliostats": [
                 {
                     "id": row.id,
@@ -311,6 +348,7 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
         normal_error_rad=normal_error,
         bound_rad=bound,
         protection=_protection(result, normal_error),
+        filtered=_filtered(result, normal_true),
     )
 
 
@@ -336,6 +374,25 @@ def _true_coefficient(result: Result) -> FloatArray | None:
     if ground is not None and result.settings.get("reflection") in ("estimate", "known"):
         value[0] = complex(*ground.coefficient)
     return np.asarray(value)
+
+
+def _filtered(result: Result, normal_true: FloatArray) -> FilteredErrors | None:
+    table = result.filtered
+    if table is None:
+        return None
+    given = np.isfinite(table.sigma_rad) & np.isfinite(normal_true).all(axis=-1)
+    off = (table.normal_enu - normal_true)[given]
+    # the normal has two angles: its covariance is singular along itself
+    inverse = np.linalg.pinv(table.cov_enu[given], rcond=1e-10, hermitian=True)
+    squared = np.einsum("na,nab,nb->n", off, inverse, off)
+    predicted = np.isin(table.status, (TrackStatus.COASTED, TrackStatus.GATED))
+    return FilteredErrors(
+        normal_error_mrad=Statistics.of(1e3 * angle_between_rad(table.normal_enu[given], normal_true[given])),
+        sigma_mrad=1e3 * _rms(table.sigma_rad[given]),
+        nees=float(np.mean(squared) / 2.0) if squared.size else np.nan,
+        given=int(np.count_nonzero(given)),
+        predicted=int(np.count_nonzero(given & predicted)),
+    )
 
 
 def _protection(result: Result, normal_error: FloatArray) -> Protection | None:

@@ -125,7 +125,7 @@ def observations(
 ) -> list[Observation]:
     """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat.
 
-    Without calibration receivers the transmitters' own phases stay in, unknown: only differences between receivers tell.
+    Without calibration receivers the transmitters' own phases stay in, unknown: differences between receivers tell.
     """
     n_frame, n_helio = len(tones.frame_start_index), len(group.column)
     n_receiver, n_transmitter = group.rows.shape[1], len(scenario.transmitter)

@@ -37,6 +37,7 @@ def process(
     pose: str = "rigid",
     reflection: str | None = None,
     integrity: bool | None = None,
+    filtered: bool | None = None,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,
@@ -62,6 +63,8 @@ def process(
         One of `rfpose.pipeline.choice.REFLECTIONS`; None: as the scenario's ``[reflection]`` says.
     integrity
         Whether residuals are tested and bad transmitters left out; None: as the scenario's ``[integrity]`` says.
+    filtered
+        Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
     force
         Overwrite an existing result, and discard unfinished work of another job on the same result.
     on_progress
@@ -88,7 +91,7 @@ def process(
     with open_recording(recording_path) as recording:
         scenario = _choose_scenario(recording, given)
         check_against(recording, scenario)
-        choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity)
+        choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
         check_solvable(scenario, pose=pose, choice=choice)
         _note_differing_receivers(recording, scenario)
         starts = _frames(recording, scenario)
@@ -101,7 +104,7 @@ def process(
         tones = measure_tones(
             recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
         )
-        asked = {"reflection": reflection, "integrity": integrity}
+        asked = {"reflection": reflection, "integrity": integrity, "filter": filtered}
         settings = _settings(recording, scenario, choice, estimator=estimator, asked=asked, scenario_path=scenario_path)
         truth = None if recording.truth is None else align_truth(recording.truth, scenario)
     result = solve(tones, scenario, settings=settings, truth=truth)
@@ -164,6 +167,8 @@ def _settings(
         command += f" --reflection {asked['reflection']}"
     if asked["integrity"] is not None:
         command += " --integrity" if asked["integrity"] else " --no-integrity"
+    if asked["filter"] is not None:
+        command += " --filter" if asked["filter"] else " --no-filter"
     learns = choice.pose == "rigid" and any(group.learns_delays for group in mirror_groups(scenario))
     return {
         "version": __version__,

@@ -23,9 +23,10 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, ScenarioError
-from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus
+from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
+from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.files import write_atomically
 from rfpose.scenario import Scenario, parse_scenario
 from rfpose.truth import Truth
@@ -36,6 +37,7 @@ __all__ = [
     "OPTIONAL",
     "VERSION",
     "DelayTable",
+    "FilteredTable",
     "FixTable",
     "IntegrityTable",
     "Key",
@@ -124,6 +126,8 @@ class PoseTable:
         Wavelengths that pose ``rigid`` rests on: tones, and the carrier, whose whole wavelengths were resolved.
     integer_risk : (frame, heliostat)
         Largest probability, beforehand, that one of them has a wrong whole wavelength. NaN for pose ``independent``.
+    integer_method : (frame, heliostat, clock)
+        `rfpose.multilat.rigid.integers.IntegerMethod` of each tone, the coarsest first, then of the carrier.
     status : (frame, heliostat)
         `rfpose.multilat.PoseStatus`.
     """
@@ -137,6 +141,7 @@ class PoseTable:
     n_receiver: npt.NDArray[np.int16]
     n_wavelength: npt.NDArray[np.int16]
     integer_risk: FloatArray
+    integer_method: npt.NDArray[np.int8]
     status: StatusArray
 
 
@@ -214,6 +219,32 @@ class DelayTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FilteredTable:
+    """Poses filtered over frames, each of the frame's middle: `rfpose.multilat.TrackedPoses`.
+
+    Attributes
+    ----------
+    normal_enu : (frame, heliostat, xyz)
+        Unit length; NaN = nothing known yet, or no longer.
+    cov_enu : (frame, heliostat, xyz, xyz)
+        Covariance of ``normal_enu`` (singular along the normal) [rad²].
+    sigma_rad : (frame, heliostat)
+        RMS angle of the normal's error, both axes together [rad].
+    pivot_enu_m, rate_enu_radps : (frame, heliostat, xyz)
+        Pivot [m]; turning rate [rad/s].
+    status : (frame, heliostat)
+        `rfpose.multilat.TrackStatus`.
+    """
+
+    normal_enu: FloatArray
+    cov_enu: FloatArray
+    sigma_rad: FloatArray
+    pivot_enu_m: FloatArray
+    rate_enu_radps: FloatArray
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
     """All that processing a recording found.
 
@@ -227,7 +258,7 @@ class Result:
         First sample of each frame, counted from the Unix epoch at the recording's sample rate.
     tones, calibration, ranges, fixes, poses
         The stages in order.
-    integrity, reflection, delays
+    integrity, reflection, delays, filtered
         What else the chosen estimator of poses found; None where it does not look for it.
     truth
         What was really there, copied from a simulated recording; else None.
@@ -244,6 +275,7 @@ class Result:
     integrity: IntegrityTable | None = None
     reflection: ReflectionTable | None = None
     delays: DelayTable | None = None
+    filtered: FilteredTable | None = None
     truth: Truth | None = None
 
     @property
@@ -317,6 +349,7 @@ KEYS: Mapping[str, Key] = {
     "poses/n_receiver": Key(_FH, "i2", "1", "receivers used"),
     "poses/n_wavelength": Key(_FH, "i2", "1", "wavelengths (tones, carrier) with resolved integers; 0: independent"),
     "poses/integer_risk": Key(_FH, "f8", "1", "largest probability of a wrong integer beforehand"),
+    "poses/integer_method": Key((*_FH, "clock"), "i1", "code", "how its whole wavelengths were found, 0 left out"),
     "poses/status": Key(_FH, "i1", "code", "why a pose is missing, 0 solved"),
     "integrity/status": Key(_FH, "i1", "code", "what tests of the residuals say, 0 consistent"),
     "integrity/transmitter_status": Key((*_FH, "transmitter"), "i1", "code", "what was left out and why, 0 used"),
@@ -333,6 +366,12 @@ KEYS: Mapping[str, Key] = {
     "delays/delay_s": Key((*_FR, "clock"), "f8", "s", "delay less that of the mirror's first receiver"),
     "delays/sigma_s": Key((*_FR, "clock"), "f8", "s", "its standard deviation"),
     "delays/jumped": Key(_FH, "?", "1", "a delay had jumped and was learned anew"),
+    "filtered/normal_enu": Key((*_FH, 3), "f8", "1", "filtered mirror normal, unit length, east, north, up"),
+    "filtered/cov_enu": Key((*_FH, 3, 3), "f8", "rad2", "its covariance"),
+    "filtered/sigma_rad": Key(_FH, "f8", "rad", "RMS angle of its error, both axes together"),
+    "filtered/pivot_enu_m": Key((*_FH, 3), "f8", "m", "filtered pivot, east, north, up"),
+    "filtered/rate_enu_radps": Key((*_FH, 3), "f8", "rad/s", "turning rate, about east, north, up"),
+    "filtered/status": Key(_FH, "i1", "code", "what became of the frame, 1 measured and taken in"),
     "truth/frame_start_index": Key(("truth_frame",), "i8", "sample", "frames of the truth"),
     "truth/normal_enu": Key(("truth_frame", "heliostat", 3), "f8", "1", "true mirror normal"),
     "truth/receiver_enu_m": Key(("truth_frame", "receiver", 3), "f8", "m", "true receiver position"),
@@ -343,7 +382,12 @@ KEYS: Mapping[str, Key] = {
 }
 """Datasets by path. Those under ``truth/`` may be absent, each on its own; those of `OPTIONAL` all together."""
 
-OPTIONAL: Mapping[str, type[Any]] = {"integrity": IntegrityTable, "reflection": ReflectionTable, "delays": DelayTable}
+OPTIONAL: Mapping[str, type[Any]] = {
+    "integrity": IntegrityTable,
+    "reflection": ReflectionTable,
+    "delays": DelayTable,
+    "filtered": FilteredTable,
+}
 """Groups that are there where the estimator of poses makes them."""
 
 _STATUS: Mapping[str, type[IntEnum]] = {
@@ -351,9 +395,11 @@ _STATUS: Mapping[str, type[IntEnum]] = {
     "calibration/status": CalibrationStatus,
     "ranges/status": RangeStatus,
     "fixes/status": FixStatus,
+    "poses/integer_method": IntegerMethod,
     "poses/status": PoseStatus,
     "integrity/status": IntegrityStatus,
     "integrity/transmitter_status": TransmitterStatus,
+    "filtered/status": TrackStatus,
 }
 
 
@@ -573,15 +619,41 @@ def summarise(result: Result) -> dict[str, Any]:
     for name, (status, codes) in parts.items():
         solved = int(np.count_nonzero(status == 0))
         summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
-    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says"}
+    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says", "filter": "off"}
     summary["choice"] = {name: result.settings.get(name, default) for name, default in choice.items()}
+    if result.settings["pose"] == "rigid":
+        summary["integers"] = _summary_of_integers(result)
     if result.integrity is not None:
         summary["integrity"] = _summary_of_integrity(result, result.integrity)
     if result.reflection is not None:
         summary["reflection"] = _summary_of_reflection(result, result.reflection)
     if result.delays is not None:
         summary["delays"] = _summary_of_delays(result.delays)
+    if result.filtered is not None:
+        summary["filtered"] = _summary_of_filtered(result.filtered)
     return summary
+
+
+def _summary_of_integers(result: Result) -> dict[str, Any]:
+    """Count, by wavelength, how integers of solved mirror-frames were found."""
+    scenario = result.scenario
+    names = [f"{f / 1e6:.9g} MHz" for f in np.sort(scenario.tone_hz)]
+    if any(h.oscillator == "shared" and h.carrier_phase for h in scenario.heliostat):
+        names.append("carrier")
+    method = result.poses.integer_method[result.poses.status == PoseStatus.OK]
+    return {
+        name: {IntegerMethod(code).reason: n for code, n in Counter(method[:, k].tolist()).most_common()}
+        for k, name in enumerate(names)
+    }
+
+
+def _summary_of_filtered(table: FilteredTable) -> dict[str, Any]:
+    sigma = table.sigma_rad[np.isfinite(table.sigma_rad)]
+    counted = Counter(table.status.ravel().tolist())
+    return {
+        "reasons": {TrackStatus(code).reason: n for code, n in counted.most_common()},
+        "sigma_mrad": 1e3 * float(np.median(sigma)) if sigma.size else None,
+    }
 
 
 def _summary_of_integrity(result: Result, table: IntegrityTable) -> dict[str, Any]:

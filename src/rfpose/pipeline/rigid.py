@@ -14,12 +14,12 @@ from scipy.stats import chi2 as chi2_distribution
 from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.geometry import azimuth_elevation_from_enu
-from rfpose.multilat import PoseStatus, RangeDifferences
+from rfpose.multilat import Motion, PoseStatus, RangeDifferences, TrackStatus, track_poses
 from rfpose.multilat.ground import GroundSolution, GroundStatus, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, full_covariance, solve_rigid
 from rfpose.multilat.rigid.delays import learn_delays
-from rfpose.multilat.rigid.integers import Observation, align_points, solve_ladder
+from rfpose.multilat.rigid.integers import IntegerMethod, Observation, align_points, solve_ladder
 from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import PoseChoice, reflectors_of
 from rfpose.pipeline.mirrors import (
@@ -30,7 +30,14 @@ from rfpose.pipeline.mirrors import (
     mirror_groups,
     observations,
 )
-from rfpose.pipeline.result_file import DelayTable, FixTable, IntegrityTable, PoseTable, ReflectionTable
+from rfpose.pipeline.result_file import (
+    DelayTable,
+    FilteredTable,
+    FixTable,
+    IntegrityTable,
+    PoseTable,
+    ReflectionTable,
+)
 from rfpose.scenario import Scenario
 
 __all__ = ["RigidOutcome", "solve_rigid_poses"]
@@ -70,6 +77,7 @@ class RigidOutcome:
     integrity: IntegrityTable | None
     reflection: ReflectionTable | None
     delays: DelayTable | None
+    filtered: FilteredTable | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +100,7 @@ class _Found:
     status: IntArray
     fixed: BoolArray
     wrong_risk: FloatArray
+    method: IntArray
     ranges: list[Observation]
     """As used: integers resolved, NaN where left out."""
     known: Knowledge
@@ -141,6 +150,8 @@ def solve_rigid_poses(
         if group.learns_delays:
             found = tables.put_delays(group, found, time_s)
         tables.put(group, found)
+        if choice.filtered:
+            tables.put_filtered(group, found, time_s, exposure_s=float(scenario.radio.frame_samples / sample_rate))
     return tables.outcome()
 
 
@@ -169,6 +180,7 @@ def _direct(stages: _Stages, group: MirrorGroup) -> _Found:
         status=_pose_status(ladder.poses.status),
         fixed=ladder.fixed,
         wrong_risk=ladder.wrong_risk,
+        method=ladder.method,
         ranges=[replace(o, range_m=z) for o, z in zip(phases, ladder.range_m, strict=True)],
         known=known,
     )
@@ -390,6 +402,7 @@ def _two_ray_of(
         status=status,
         fixed=solution.fixed,
         wrong_risk=solution.wrong_risk,
+        method=np.where(solution.fixed, IntegerMethod.ROUNDED, IntegerMethod.FLOAT),
         ranges=[replace(o, range_m=z) for o, z in zip(phases, solution.range_m, strict=True)],
         known=known,
         full_cov=solution.full_cov,
@@ -494,6 +507,7 @@ def _in_order(parts: list[_Found], order: IntArray, known: Knowledge) -> _Found:
                 "status",
                 "fixed",
                 "wrong_risk",
+                "method",
                 "full_cov",
                 "probability_all",
                 "coefficient",
@@ -602,6 +616,19 @@ class _Tables:
                 "coefficient_sigma": np.full((*frame_mirror, n_plane, 2), np.nan),
                 "probability_direct": np.full(frame_mirror, np.nan),
             }
+        self._filtered: dict[str, npt.NDArray[Any]] = {}
+        if choice.filtered:
+            self._filtered = {
+                name: np.full((*frame_mirror, *shape), np.nan)
+                for name, shape in (
+                    ("normal_enu", (3,)),
+                    ("cov_enu", (3, 3)),
+                    ("sigma_rad", ()),
+                    ("pivot_enu_m", (3,)),
+                    ("rate_enu_radps", (3,)),
+                )
+            }
+            self._filtered["status"] = np.full(frame_mirror, TrackStatus.UNKNOWN, np.int8)
         self._delays: dict[str, npt.NDArray[Any]] = {}
         if any(group.learns_delays for group in mirror_groups(scenario)):
             n_clock = len(scenario.tone) + 1
@@ -631,6 +658,7 @@ class _Tables:
                 + np.einsum("mab,mb->ma", poses.rot_enu_from_mirror, places.mean(axis=1)),
                 "n_receiver": np.where(np.isfinite(normal[:, 0]), group.rows.shape[1], 0),
                 "n_wavelength": found.fixed.sum(axis=1),
+                "integer_method": self._methods(group, found),
                 "integer_risk": np.where(found.fixed, found.wrong_risk, 0.0).max(axis=1),
                 "status": found.status,
             },
@@ -657,6 +685,46 @@ class _Tables:
         if self._reflection:
             names = ("coefficient", "coefficient_sigma", "probability_direct")
             self._put(self._reflection, group, {name: getattr(found, name) for name in names})
+
+    def _methods(self, group: MirrorGroup, found: _Found) -> IntArray:
+        """(mirror, clock) how integers were found; what a pose that failed rests on says nothing."""
+        out = np.full((len(found.method), len(self._stages.scenario.tone) + 1), IntegerMethod.FLOAT, np.int64)
+        out[:, : found.method.shape[1]] = np.where(np.isfinite(found.poses.tilt_sigma_rad)[:, None], found.method, 0)
+        return out
+
+    def put_filtered(self, group: MirrorGroup, found: _Found, time_s: FloatArray, *, exposure_s: float) -> None:
+        """Filter a group's poses over frames and write them; poses that are doubted are left out."""
+
+        def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            return array.reshape(self._n_frame, len(group.column), *array.shape[1:])
+
+        poses, table = found.poses, self._stages.scenario.motion
+        tracked = track_poses(
+            by_frame(poses.pivot_enu_m),
+            by_frame(poses.rot_enu_from_mirror),
+            by_frame(poses.cov),
+            time_s=time_s + 0.5 * exposure_s,
+            exposure_s=exposure_s,
+            usable=by_frame(found.status == PoseStatus.OK),
+            motion=Motion(
+                rate_walk_radps_per_sqrt_s=table.rate_walk_radps_per_sqrt_s,
+                rate_sigma_radps=table.rate_sigma_radps,
+                gate_probability=table.gate_probability,
+                restart_after=table.restart_after,
+                max_coast_s=np.inf if table.max_coast_s is None else table.max_coast_s,
+            ),
+        )
+        cross = _cross_matrix(tracked.normal_enu)
+        values = {
+            "normal_enu": tracked.normal_enu,
+            "cov_enu": cross @ tracked.cov[..., 3:6, 3:6] @ cross.swapaxes(-1, -2),
+            "sigma_rad": tracked.tilt_sigma_rad,
+            "pivot_enu_m": tracked.pivot_enu_m,
+            "rate_enu_radps": tracked.rate_enu_radps,
+            "status": tracked.status,
+        }
+        for name, array in values.items():
+            self._filtered[name][:, group.column] = array
 
     def _put(self, table: dict[str, npt.NDArray[Any]], group: MirrorGroup, values: dict[str, Any]) -> None:
         for name, array in values.items():
@@ -715,6 +783,7 @@ class _Tables:
             integrity=IntegrityTable(**self._integrity) if self._integrity else None,
             reflection=ReflectionTable(**self._reflection) if self._reflection else None,
             delays=DelayTable(**self._delays) if self._delays else None,
+            filtered=FilteredTable(**self._filtered) if self._filtered else None,
         )
 
 

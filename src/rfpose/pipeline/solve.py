@@ -108,8 +108,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     scenario
         The site.
     settings
-        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``. ``reflection`` and ``integrity``
-        choose the estimator of poses; without them the scenario does.
+        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``. ``reflection``, ``integrity``
+        and ``filter`` choose the estimator of poses; without them the scenario does.
     truth
         Kept with the result.
 
@@ -134,7 +134,7 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     fixes = _fix_table(poses.fixes, n_frame, n_receiver)
     if not is_calibrated(scenario):
         fixes = replace(fixes, status=np.where(_received(tones).any(axis=2), FixStatus.UNCALIBRATED, fixes.status))
-    independent = _pose_table(poses)
+    independent = _pose_table(poses, len(scenario.tone))
     rigid = None
     if choice.pose == "rigid":
         rigid = solve_rigid_poses(
@@ -159,6 +159,7 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         integrity=None if rigid is None else rigid.integrity,
         reflection=None if rigid is None else rigid.reflection,
         delays=None if rigid is None else rigid.delays,
+        filtered=None if rigid is None else rigid.filtered,
         truth=truth,
     )
 
@@ -209,8 +210,8 @@ def _fix_table(fixes: Fixes, n_frame: int, n_receiver: int) -> FixTable:
     return FixTable(**{name: array.reshape(n_frame, n_receiver, *array.shape[1:]) for name, array in arrays.items()})
 
 
-def _pose_table(poses: Poses) -> PoseTable:
-    own = {"centre_enu_m", "n_wavelength", "integer_risk"}
+def _pose_table(poses: Poses, n_tone: int) -> PoseTable:
+    own = {"centre_enu_m", "n_wavelength", "integer_risk", "integer_method"}
     names = [name for name in PoseTable.__dataclass_fields__ if name not in own]
     shape = poses.normals.sigma_rad.shape
     return PoseTable(
@@ -218,4 +219,5 @@ def _pose_table(poses: Poses) -> PoseTable:
         centre_enu_m=poses.centre_enu_m,
         n_wavelength=np.zeros(shape, np.int16),
         integer_risk=np.full(shape, np.nan),
+        integer_method=np.zeros((*shape, n_tone + 1), np.int8),
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from rfpose.scenario._reading import load_scenario, parse_scenario
 from rfpose.scenario._scenario import Receiver, Scenario
 from rfpose.scenario.budget import Budget
-from rfpose.scenario.estimation import Integrity, Plane, Reflection
+from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
 from rfpose.scenario.records import (
     MAX_FRAME_SAMPLES,
     MIN_FRAME_SAMPLES,
@@ -36,6 +36,7 @@ __all__ = [
     "Heliostat",
     "Integrity",
     "Mirror",
+    "Motion",
     "Plane",
     "Radio",
     "Receiver",

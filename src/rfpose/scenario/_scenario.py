@@ -15,7 +15,7 @@ from rfpose.errors import ScenarioError
 from rfpose.scenario._consistency import CHECKS
 from rfpose.scenario._scaling import scale_lengths
 from rfpose.scenario.budget import Budget
-from rfpose.scenario.estimation import Integrity, Reflection
+from rfpose.scenario.estimation import Integrity, Motion, Reflection
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
 from rfpose.scenario.tracking import Tracking
@@ -46,6 +46,7 @@ class Scenario(Record):
     simulation: Simulation = Simulation()
     reflection: Reflection = Reflection()
     integrity: Integrity = Integrity()
+    motion: Motion = Motion()
     budget: Budget = Budget()
     tracking: Tracking = Tracking()
 

@@ -7,9 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from rfpose.scenario.records import Identifier, NonNegative, Point, Record
+from rfpose.scenario.records import Identifier, NonNegative, Point, Positive, Record
 
-__all__ = ["Integrity", "Plane", "Reflection"]
+__all__ = ["Integrity", "Motion", "Plane", "Reflection"]
 
 Coefficient = tuple[float, float]
 Probability = Annotated[float, Field(gt=0, lt=1)]
@@ -83,6 +83,23 @@ class Integrity(Record):
     """That the normal is farther off than the protection level without a warning, one transmitter being wrong."""
     max_excluded: Annotated[int, Field(ge=0)] = 4
     """Transmitters and priors to leave out of one mirror at most; 0 only tests."""
+
+
+class Motion(Record):
+    """How mirrors move, for the filter of poses over frames."""
+
+    filtered: bool = False
+    """Whether poses are filtered, unless the command line says otherwise."""
+    rate_walk_radps_per_sqrt_s: NonNegative = 1e-6
+    """Random walk of the turning rate, each axis; 0: the rate is constant."""
+    rate_sigma_radps: Positive = 1e-2
+    """What the rate may be when nothing was measured yet, each axis."""
+    gate_probability: Probability = 1e-6
+    """A pose rarer than this under the prediction is left out."""
+    restart_after: Annotated[int, Field(ge=1)] = 3
+    """So many rejected frames in a row are believed after all."""
+    max_coast_s: Positive | None = None
+    """A prediction older than this is given up; without it never."""
 
 
 def _check_normal(normal: Point) -> None:
