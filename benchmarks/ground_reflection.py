@@ -1,6 +1,6 @@
 """Print how well poses come out where the ground reflects, how that degrades, and how long it takes.
 
-    python benchmarks/ground_reflection.py [--mirrors 200] [--scenarios 10] [--speed]
+    python benchmarks/ground_reflection.py [--mirrors 200] [--scenarios 10] [--speed | --strong]
 
 Design fact 7: field of Table 2 x100, three receivers 1.73 m apart, phase noise 80 µrad, pivots surveyed to 5 mm, tones
 of 0.75 and 7.5 MHz, no calibration receiver, starts 100 mrad off. Errors are of the mirror normal, rms, in mrad.
@@ -161,18 +161,25 @@ def draw_coefficient(rng: np.random.Generator) -> complex:
     return complex(rng.uniform(0.02, 0.5) * np.exp(2j * np.pi * rng.uniform()))
 
 
-def reach(n_mirror: int, n_scenario: int) -> None:
-    """Print errors with the coefficient estimated, and without."""
-    print(
-        f"random coefficients up to 0.5, {n_scenario} scenarios of {n_mirror} mirrors; rms of all, mrad of the normal"
-    )
+def reach(
+    n_mirror: int,
+    n_scenario: int,
+    *,
+    rf: tuple[float, ...] = (30e6, 100e6, 433e6),
+    size: float | None = None,
+) -> None:
+    """Print errors with the coefficient estimated, and without; of one ``size`` and random phase where it is given."""
+    sizes = "up to 0.5" if size is None else f"of size {size:g}"
+    print(f"random coefficients {sizes}, {n_scenario} scenarios of {n_mirror} mirrors; rms of all, mrad of the normal")
     print("RF MHz  carrier   bound, no reflection   estimated  ratio  worst scenario   ignored  hurt  reported  not OK")
-    for rf_hz in (30e6, 100e6, 433e6):
+    for rf_hz in rf:
         for carrier in (False, True):
             error, bound, worst, ignored, hurt, reported, lost = [], [], 0.0, [], 0, 0, 0
             for seed in range(n_scenario):
                 rng = np.random.default_rng(seed)
-                field = measure(rng, n_mirror, rf_hz, [(Reflector(), draw_coefficient(rng))], carrier=carrier)
+                drawn = draw_coefficient(rng)
+                coefficient = drawn if size is None else drawn / abs(drawn) * size
+                field = measure(rng, n_mirror, rf_hz, [(Reflector(), coefficient)], carrier=carrier)
                 solution, without = field.solve(), field.solve(())
                 error.append(rms(field.error_mrad(solution)))
                 bound.append(field.bound_mrad())
@@ -272,7 +279,11 @@ def main() -> None:
     parser.add_argument("--mirrors", type=int, default=200)
     parser.add_argument("--scenarios", type=int, default=10)
     parser.add_argument("--speed", action="store_true", help="times only")
+    parser.add_argument("--strong", action="store_true", help="coefficients of size 0.5 at 433 MHz only")
     arguments = parser.parse_args()
+    if arguments.strong:
+        reach(arguments.mirrors, arguments.scenarios, rf=(433e6,), size=0.5)
+        return
     if not arguments.speed:
         reach(arguments.mirrors, arguments.scenarios)
         degradation(arguments.mirrors)
