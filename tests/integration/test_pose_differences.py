@@ -90,6 +90,23 @@ def test_calibration_receivers_of_a_recording_can_be_left_alone(tmp_path: Path) 
     assert both[1].normal_error_mrad.rms == pytest.approx(both[0].normal_error_mrad.rms, rel=0.02)
 
 
+def test_an_old_calibration_does_no_harm(tmp_path: Path) -> None:
+    data = site(CLOCKS["one clock"]).model_dump(exclude_none=True)
+    data["simulation"]["dropped"] = [
+        {"receiver": c["id"], "frame": f, "first_sample": 0, "sample_count": 4000}
+        for c in data["calibration_receiver"]
+        for f in range(3, N_FRAME)
+    ]
+    (tmp_path / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    simulate_recording(tmp_path / "site.toml", tmp_path / "rec.h5", seed=5)
+    rigid = evaluate(process(tmp_path / "rec.h5", tmp_path / "r.h5", estimator="correlator"))
+    fits = evaluate(process(tmp_path / "rec.h5", tmp_path / "i.h5", estimator="correlator", pose="independent"))
+    assert rigid.failed == 0
+    assert abs(rigid.ratio_to_bound - 1.0) < 4.0 / np.sqrt(4.0 * 4 * N_FRAME)
+    # three fits take the drift for geometry
+    assert fits.normal_error_mrad.rms > 1000.0 * rigid.normal_error_mrad.rms
+
+
 def _not_surveyed(data: dict[str, Any]) -> None:
     del data["heliostat"][1]["pivot_sigma_m"]
 
