@@ -1,0 +1,362 @@
+"""A small field tracked by radio, one control interval at a time, and disturbed on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, as_positive, read_only
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback import _kernels as mount_kernels
+from rfpose.feedback.fieldcontrol.control import FieldControl
+from rfpose.feedback.fieldcontrol.modes import Mode
+from rfpose.feedback.fieldcontrol.motion import move_axes
+from rfpose.feedback.tracking import _kernels
+from rfpose.feedback.tracking.hidden import generator
+from rfpose.feedback.tracking.instruments import Workshop
+from rfpose.feedback.tracking.loops import check_gains
+from rfpose.feedback.tracking.methods import METHODS
+from rfpose.feedback.tracking.radio import RadioErrors, RadioModel
+from rfpose.feedback.tracking.simulation import Simulation
+from rfpose.scenario import Scenario
+
+__all__ = ["MOST_MIRRORS", "LiveField", "Moment", "live_scenario"]
+
+MOST_MIRRORS = 50
+"""A live field has no more mirrors than this: the first of the scenario."""
+_AIM_ENU_M = (0.0, 0.0, 50.0)
+_PLACE_DEG = (37.1, -2.4)
+_LEAST_WIND_MPS = 1e-3
+_RADIO_EVERY_S = 60.0
+_CALM_MPS = 0.0
+_STANDING = 1e-12
+"""Speed of a stopped motor [counts a step]: too small to move it, and not zero, which the kernel divides by."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moment:
+    """A field at the end of a step; rows are mirrors.
+
+    Attributes
+    ----------
+    unix_s
+        [s since 1970 UTC].
+    sun_enu : (xyz)
+        Towards the sun.
+    normal_enu : (mirror, xyz)
+        True normals.
+    error_rad : (mirror,)
+        Angle between true and wanted normal [rad]; NaN: aim point out of reach.
+    radio_sigma_rad : (mirror,)
+        What one radio frame knows the normal to [rad]; NaN: no pose.
+    wind_mps
+        Mean wind and the gust under way [m/s].
+    mode : (mirror,)
+        `Mode` of each.
+    stopped : (mirror,)
+        Whose motors stand.
+    dead : (transmitter,)
+        Which are off the air.
+    """
+
+    unix_s: float
+    sun_enu: FloatArray
+    normal_enu: FloatArray
+    error_rad: FloatArray
+    radio_sigma_rad: FloatArray
+    wind_mps: float
+    mode: npt.NDArray[np.int8]
+    stopped: npt.NDArray[np.bool_]
+    dead: npt.NDArray[np.bool_]
+
+    @property
+    def rms_rad(self) -> float:
+        """Rms normal error of the mirrors that have one [rad]; NaN: none."""
+        known = self.error_rad[np.isfinite(self.error_rad)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+class _Radio(RadioModel):
+    """The radio model with transmitters off the air."""
+
+    def __init__(self, scenario: Scenario, pivot_enu_m: FloatArray, *, usual_normal_enu: FloatArray) -> None:
+        self.dead = np.zeros(len(scenario.transmitter), np.bool_)
+        super().__init__(scenario, pivot_enu_m, usual_normal_enu=usual_normal_enu)
+
+    def _covariance(self, rot: FloatArray, hidden: npt.NDArray[np.bool_]) -> FloatArray:
+        return super()._covariance(rot, hidden | self.dead)
+
+
+def live_scenario(scenario: Scenario) -> Scenario:
+    """Return a scenario for one day, with a place on Earth and an aim point where it has none.
+
+    Without ``latitude_deg`` and ``longitude_deg`` the field stands at 37.1 degrees north, 2.4 west; without
+    ``aim_enu_m`` it aims 50 m above the origin.
+
+    Raises
+    ------
+    ScenarioError
+        A field of dishes, or no mirrors.
+    """
+    if scenario.tracking.collector != "heliostat":
+        raise ScenarioError("a live field steers heliostats; set [tracking] `collector` to heliostat")
+    if not scenario.heliostat:
+        raise ScenarioError("the scenario has no heliostats to steer live; add some [[heliostat]]")
+    site = scenario.site
+    changes: dict[str, object] = {}
+    if site.latitude_deg is None or site.longitude_deg is None:
+        changes |= {"latitude_deg": _PLACE_DEG[0], "longitude_deg": _PLACE_DEG[1]}
+    if site.aim_enu_m is None:
+        changes["aim_enu_m"] = _AIM_ENU_M
+    return scenario.model_copy(
+        update={
+            "site": site.model_copy(update=changes),
+            "tracking": scenario.tracking.model_copy(update={"days": 1}),
+        }
+    )
+
+
+class LiveField:
+    """A field in closed radio loop on the scenario's first day; go on with `step`, disturb it at any time.
+
+    Mounts, drives, wind, radio and loop are those of `Simulation`, whose step this takes one control interval at a
+    time. In an emergency `FieldControl` moves the axes instead, at the drives' speed; wind does not bend the mirrors
+    then.
+
+    Parameters
+    ----------
+    scenario
+        As `live_scenario` gives it.
+    seed
+        The same seed and the same disturbances at the same steps give the same course.
+    start_hour
+        Local mean solar time of the first step [h]; within the day.
+
+    Raises
+    ------
+    ScenarioError, GeometryError, InvalidInputError
+        See `Simulation`.
+    """
+
+    def __init__(self, scenario: Scenario, *, seed: int = 0, start_hour: float = 10.0) -> None:
+        count = min(MOST_MIRRORS, len(scenario.heliostat)) or None
+        check_gains(scenario)
+        self._plan = Simulation(scenario, methods=("open-loop",), count=count, seed=seed)
+        self._run = self._plan._start(METHODS["radio"])
+        self.field, self._day = self._plan.field, self._plan.days[0]
+        self._scenario, self._seed = scenario, int(seed)
+        self._servo_s = scenario.tracking.servo_interval_s
+        self._interval = self._run.loop.interval
+        late = int(np.searchsorted(self._day.hour, start_hour))
+        last = len(self._day.unix_s) - self._interval
+        self._at = max(min(late, last) // self._interval * self._interval, 0)
+        noon = int(np.argmax(self._day.sun_enu[: len(self._day.unix_s), 2]))
+        self._radio = _Radio(scenario, self.field.pivot_enu_m, usual_normal_enu=self._wanted_enu(noon))
+        workshop = Workshop(scenario, self.field, self._radio, self._plan.gusts, seed=seed)
+        self._run.model[:] = workshop.model(METHODS["radio"], self._day)
+        self._gust_state = self._plan.gusts.process.start(generator(seed, 11, 0), len(self.field))
+        self._gusts: list[tuple[float, float, float]] = []
+        self._stopped = np.zeros(len(self.field), np.bool_)
+        self._control: FieldControl | None = None
+        self._radio_due = self._at
+        self._radio_errors = self._measure()
+        self._run.state[:, _kernels.NEXT] = self._nearest_count()
+
+    # -- what it is ----------------------------------------------------------------------------------------
+
+    @property
+    def step_s(self) -> float:
+        """How far one step goes [s]."""
+        return self._interval * self._servo_s
+
+    @property
+    def transmitter_ids(self) -> tuple[str, ...]:
+        """Names of the transmitters, as `kill_transmitter` takes them."""
+        return self._scenario.transmitter_ids
+
+    @property
+    def over(self) -> bool:
+        """Whether the day is over, so that there is no further step."""
+        return self._at + self._interval > len(self._day.unix_s)
+
+    # -- disturbances --------------------------------------------------------------------------------------
+
+    def gust(self, speed_mps: float = 15.0, duration_s: float = 40.0) -> None:
+        """Let the wind rise by so much over all mirrors and fall again, as one minus a cosine, from now on."""
+        now = float(self._day.unix_s[min(self._at, len(self._day.unix_s) - 1)])
+        self._gusts.append((now, as_positive("duration_s", duration_s), as_positive("speed_mps", speed_mps)))
+
+    def kill_transmitter(self, name: str) -> None:
+        """Take a transmitter off the air.
+
+        Raises
+        ------
+        InvalidInputError
+            No transmitter of this name.
+        """
+        if name not in self.transmitter_ids:
+            raise InvalidInputError(f"no transmitter is called {name!r}; known are {', '.join(self.transmitter_ids)}")
+        self._radio.dead[self.transmitter_ids.index(name)] = True
+        self._radio_due = self._at
+
+    def stop_motor(self, name: str) -> None:
+        """Let both motors of a mirror stand.
+
+        Raises
+        ------
+        InvalidInputError
+            No mirror of this name.
+        """
+        if name not in self.field.ids:
+            raise InvalidInputError(f"no mirror is called {name!r}; known are {', '.join(self.field.ids[:8])}")
+        self._stopped[self.field.ids.index(name)] = True
+
+    def emergency(self) -> None:
+        """Order the field off its target at full speed, then into stow."""
+        if self._control is None:
+            self._control = FieldControl(
+                aim_enu_m=self.field.target[:, :3],
+                pivot_enu_m=self.field.pivot_enu_m,
+                mode=Mode.TRACK,
+                start_s=self._at * self._servo_s,
+                rng=generator(self._seed, 12, self._at),
+            )
+            self._control.emergency()
+
+    def normal(self) -> None:
+        """End all disturbances: the wind calms, all transmitters and motors work, mirrors go back to the target."""
+        self._gusts.clear()
+        self._radio.dead[:] = False
+        self._radio_due = self._at
+        self._stopped[:] = False
+        if self._control is not None:
+            self._control = None
+            self._run.ring[:] = 0.0
+            self._run.state[:, _kernels.RAMP : _kernels.RAMP + 3] = 0.0
+
+    # -- going on ------------------------------------------------------------------------------------------
+
+    def step(self) -> Moment:
+        """Go on by one control interval and return what is then.
+
+        Raises
+        ------
+        InvalidInputError
+            The day is over.
+        """
+        if self.over:
+            raise InvalidInputError(f"the day {self._day.date} is over; start anew")
+        if self._at >= self._radio_due:
+            self._radio_errors = self._measure()
+        steps = slice(self._at, self._at + self._interval)
+        extra = self._gust_mps(self._day.unix_s[steps])
+        if self._control is None:
+            normal, error = self._track(steps, extra)
+            mode = np.full(len(self.field), Mode.TRACK, np.int8)
+        else:
+            normal, error, mode = self._obey(self._control, steps)
+        self._at += self._interval
+        sigma = np.where(self._radio_errors.solved, self._radio_errors.sigma_rad, np.nan)
+        return Moment(
+            unix_s=float(self._day.unix_s[steps][-1]),
+            sun_enu=read_only(self._day.sun_enu[self._at - 1].copy()),
+            normal_enu=read_only(normal),
+            error_rad=read_only(error),
+            radio_sigma_rad=read_only(sigma),
+            wind_mps=float(self._plan.gusts.mean_mps + extra[-1]),
+            mode=mode,
+            stopped=self._stopped.copy(),
+            dead=self._radio.dead.copy(),
+        )
+
+    def _measure(self) -> RadioErrors:
+        self._radio_due = self._at + round(_RADIO_EVERY_S / self._servo_s)
+        return self._radio.errors(self._wanted_enu(self._at), generator(self._seed, 13, self._at))
+
+    def _wanted_enu(self, i_step: int) -> FloatArray:
+        return self._plan._wanted_normal(self._day, i_step)
+
+    def _nearest_count(self) -> FloatArray:
+        """Azimuth motors' counts towards the first wanted normals, nearest to the middle of their travel."""
+        azimuth = geometry.azimuth_elevation_from_enu(self._wanted_enu(self._at))[0]
+        way = np.mod(azimuth - self.field.constant[:, 15] + np.pi, 2.0 * np.pi) - np.pi
+        return np.asarray(way * self.field.constant[:, 13])
+
+    def _gust_mps(self, unix_s: FloatArray) -> FloatArray:
+        """(step,) what the gusts under way add to the wind; those that have passed are forgotten."""
+        self._gusts = [gust for gust in self._gusts if unix_s[0] <= gust[0] + gust[1]]
+        total = np.zeros(len(unix_s))
+        for begin, duration, speed in self._gusts:
+            part = (unix_s - begin) / duration
+            total += np.where(part <= 1.0, 0.5 * speed * (1.0 - np.cos(2.0 * np.pi * part)), 0.0)
+        return total
+
+    def _track(self, steps: slice, extra_mps: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Take all mirrors through a step in closed loop; those with stopped motors without moving."""
+        n, plan = len(self.field), self._scenario.tracking
+        mean = max(self._plan.gusts.mean_mps, _LEAST_WIND_MPS)
+        wind = self._plan.gusts.run(
+            self._gust_state, generator(self._seed, 14, self._at), self._day.unix_s[steps]
+        ).astype(np.float64)
+        # the kernel's push is V² + 2 V g: what makes it the square of the speed with the gust
+        gust = (wind + ((mean + wind) * extra_mps + 0.5 * extra_mps**2) / mean).astype(np.float32)
+        rng = generator(self._seed, 15, self._at)
+        noise = rng.standard_normal((n, 1, 2), dtype=np.float32)
+        lost = (rng.random((n, 1), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
+        lost[~self._radio_errors.solved] = 1
+        normal, error = np.empty((n, 3)), np.empty(n)
+        for rows, runs in ((np.flatnonzero(~self._stopped), True), (np.flatnonzero(self._stopped), False)):
+            if rows.size:
+                normal[rows], error[rows] = self._advance(rows, runs, steps, mean, gust, noise, lost)
+        return normal, error
+
+    def _advance(
+        self, rows: npt.NDArray[np.int64], runs: bool, steps: slice, mean_mps: float,
+        gust: npt.NDArray[np.float32], noise: npt.NDArray[np.float32], lost: npt.NDArray[np.uint8],
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        """Call the kernel for some mirrors and put their state back; true normals and errors at the end."""
+        run, field, day, n_step = self._run, self.field, self._day, self._interval
+        drives = [self._plan._drive(axis) for axis in (0, 1)]
+        if not runs:
+            drives = [drive._replace(speed=_STANDING) for drive in drives]
+        state, ring, model = run.state[rows], run.ring[rows], run.model[rows]
+        total, hours, histogram = run.total[0, rows], run.hours[rows], run.histogram[rows]
+        error, trace = np.full((len(rows), n_step), np.nan), np.full((len(rows), n_step, 8), np.nan)
+        _kernels.advance(
+            run.loop, run.law, drives[0], drives[1],
+            steps.start, field.at(0.0)[rows], field.constant[rows], field.lean_rad[rows], day.heat[steps].copy(),
+            model, np.broadcast_to(run.cov, (len(rows), *run.cov.shape[1:])).copy(),
+            np.zeros(run.cov.shape[1], np.int64), np.zeros(run.cov.shape[1]), np.zeros(run.cov.shape[1]),
+            day.sun_enu[steps.start : steps.stop + n_step + 1].copy(), field.target[rows], gust[rows], mean_mps,
+            self._plan.gusts.bend, noise[rows], self._radio_errors.spread_rad[rows],
+            self._radio_errors.bias_rad[rows], lost[rows], np.zeros((len(rows), n_step), np.uint8),
+            day.power_w_per_m2[steps].copy(), field.plate_drift_rad[rows], field.sensor_bias_rad[rows],
+            state, ring, total, hours, day.hour[steps].astype(np.int64), histogram, 1, error,
+            np.arange(len(rows)), trace,
+        )  # fmt: skip
+        run.state[rows], run.ring[rows] = state, ring
+        return trace[:, -1, :3], error[:, -1]
+
+    def _obey(self, control: FieldControl, steps: slice) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int8]]:
+        """Move the axes as field control says; true normals, errors and modes at the end."""
+        state, home, per_rad = self._run.state, self.field.constant[:, 15:17], self.field.constant[:, 13:15]
+        motor = slice(_kernels.MOTOR, _kernels.MOTOR + 2)
+        rate = 1e-3 * self._scenario.tracking.drive.speed_mradps
+        for i in range(steps.start, steps.stop):
+            axis = home + state[:, motor] / per_rad
+            orders = control.step(
+                i * self._servo_s, axis_rad=axis, aim_axis_rad=axis, sun_enu=self._day.sun_enu[i], wind_m_s=_CALM_MPS
+            )
+            move = (move_axes(axis, orders.target_axis_rad, self._servo_s, rate_rad_s=rate) - axis) * per_rad
+            move[self._stopped] = 0.0
+            for first in (_kernels.MOTOR, _kernels.AXIS, _kernels.GOAL):  # the gear's play is kept as it is
+                state[:, first : first + 2] += move
+        count = np.ascontiguousarray(state[:, None, _kernels.AXIS : _kernels.AXIS + 2])
+        posture = mount_kernels.posture_batch(self.field.at(0.0), self.field.constant, count, 0.0)[:, 0]
+        normal = posture[:, 2:5]
+        wanted = geometry.bisector_enu(self.field.target[:, :3] - posture[:, 5:8], self._day.sun_enu[steps.stop - 1])
+        error = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(normal - wanted, axis=1), 1.0))
+        return normal, error, orders.mode
