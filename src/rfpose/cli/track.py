@@ -33,6 +33,7 @@ _METHODS = (
     epilog=examples(
         "rfpose track data/tracking_100m.toml -o day.h5",
         "rfpose track site.toml -o year.h5 --heliostats 100 --days 12 --day-interval 30 --picture year.png",
+        "rfpose track site.toml -o clouds.h5 --days 12 --day-interval 30 --sky bursts",
         "rfpose track site.toml -o field.h5 --heliostats 10000 --methods radio",
     ),
 )
@@ -44,6 +45,9 @@ _METHODS = (
 @click.option("--days", type=click.IntRange(min=1), help="How many days; default: the scenario's.")
 @click.option("--day-interval", type=click.IntRange(min=1), help="Days from one simulated day to the next.")
 @click.option("--heliostats", type=int, help="How many mirrors; more than the scenario lists: spread over its field.")
+@click.option(
+    "--sky", type=click.Choice(["clear", "bursts"]), help="Clear, or clouds and sun by turns; default: the scenario's."
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
@@ -58,6 +62,7 @@ def command(
     days: int | None,
     day_interval: int | None,
     heliostats: int | None,
+    sky: str | None,
     seed: int,
     csv_path: Path | None,
     picture: Path | None,
@@ -86,6 +91,7 @@ def command(
             days=days,
             day_interval=day_interval,
             heliostats=heliostats,
+            sky=sky,
             seed=seed,
             force=force,
             on_progress=on_progress,
@@ -115,6 +121,12 @@ def command(
             say(
                 f"  {name}: {outage['rms_mrad']:.3g} mrad while radio was out, "
                 f"{outage['loss_kwh_per_m2']:.3g} kWh/m² lost by it"
+            )
+        sun = summary["methods"][name]["sunshine"]
+        if sun["response_loss"] is not None:
+            say(
+                f"  {name}: {sun['bursts']:.4g} times out of clouds, {1e3 * sun['response_loss']:.2g} ‰ of the light "
+                f"lost in the first {sun['response_window_s']:.0f} s, {1e3 * sun['turning_loss']:.2g} ‰ by turning"
             )
         if summary["methods"][name]["out_of_reach"]:
             share = 100.0 * summary["methods"][name]["out_of_reach"]

@@ -26,6 +26,7 @@ def track(
     days: int | None = None,
     day_interval: int | None = None,
     heliostats: int | None = None,
+    sky: str | None = None,
     seed: int = 0,
     force: bool = False,
     checkpoint_s: float = 20.0,
@@ -46,6 +47,8 @@ def track(
         Instead of those in ``[tracking]``.
     heliostats
         How many mirrors; see `rfpose.feedback.tracking.hidden.field_positions`.
+    sky
+        ``clear`` or ``bursts``, instead of that in ``[tracking]``.
     seed
         Same scenario and seed, same result.
     force
@@ -64,7 +67,7 @@ def track(
     """
     result_path = Path(result_path)
     refuse_existing(result_path, force=force)
-    scenario = _with(load_scenario(scenario_path), days=days, day_interval=day_interval)
+    scenario = _with(load_scenario(scenario_path), days=days, day_interval=day_interval, sky=sky)
     try:
         simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
     except (ScenarioError, GeometryError, InvalidInputError) as error:

@@ -178,6 +178,8 @@ class Tracking(Record):
     field_radius_m: Positive = 100.0
     """Where ``--heliostats`` puts mirrors that the scenario does not list."""
     inner_radius_m: NonNegative = 10.0
+    sky: Literal["clear", "bursts"] = "clear"
+    """Bursts: every second day or so in clouds, as at Griffith (Edwards, App. B)."""
     servo_interval_s: Positive = 1.0
     control_interval_s: Positive = 4.0
     first_hour: Hour = 0.0

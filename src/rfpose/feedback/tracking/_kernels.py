@@ -20,8 +20,8 @@ NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
 # state of a mirror under one method
 MOTOR, AXIS, COMMAND, NEXT, SLIP, MOVED, INNOVATION, SHIFT, RAMP = 0, 2, 4, 6, 8, 10, 12, 14, 17
-GOAL, LEARNED, SILENT, STARTED, UNREACHABLE = 20, 22, 23, 24, 25
-N_STATE = 26
+GOAL, LEARNED, SILENT, STARTED, UNREACHABLE, CLOUDED, FRESH = 20, 22, 23, 24, 25, 26, 27
+N_STATE = 28
 
 # a measurement on its way
 N_RING, N_ENTRY = 16, 6
@@ -30,8 +30,12 @@ N_RING, N_ENTRY = 16, 6
 (
     STEPS, SQUARE, WORST, BEAM_SQUARE, BEAM_WORST, ENERGY, CAUGHT, MOTOR_1, MOTOR_2, STARTS, OUT_OF_REACH,
     OUTAGE_STEPS, OUTAGE_SQUARE, OUTAGE_ENERGY, OUTAGE_CAUGHT, FRAMES, FRAMES_LOST, COLD,
-) = range(18)  # fmt: skip
-N_SUM = 18
+    SUNSHINE, BURSTS, BURST_ERROR, TURNING, FRESH_ENERGY, FRESH_CAUGHT,
+) = range(24)  # fmt: skip
+N_SUM = 24
+
+RESPONSE_S = 30.0
+"""How long after the sun comes out light is counted apart, for what the response costs."""
 
 BINS_PER_DECADE, N_BIN = 32, 160
 LOWEST_RAD = 1e-6
@@ -338,6 +342,9 @@ def _track(
             angle += error[i] * error[i]
         angle = math.sqrt(angle)
         dark = outage[s] > 0
+        emerged = state[CLOUDED] > 0.0 and power[s] > 0.0
+        state[CLOUDED] = 0.0 if power[s] > 0.0 else 1.0
+        state[FRESH] = RESPONSE_S / loop.servo_s if emerged else max(state[FRESH] - 1.0, 0.0)
         if g >= loop.settle:
             if state[UNREACHABLE] > 0.0:
                 total[OUT_OF_REACH] += 1.0
@@ -365,6 +372,12 @@ def _track(
                 hours[hour_of[s], 1] += angle * angle
                 slot = int(BINS_PER_DECADE * math.log10(max(angle, LOWEST_RAD) / LOWEST_RAD))
                 histogram[min(slot, N_BIN - 1)] += 1
+                if power[s] > 0.0:
+                    total[SUNSHINE] += loop.servo_s
+                if emerged:
+                    total[BURSTS] += 1.0
+                    total[BURST_ERROR] += angle
+                    total[TURNING] += angle * k[13] / drive_1.speed * loop.servo_s
                 if dark:
                     total[OUTAGE_STEPS] += 1.0
                     total[OUTAGE_SQUARE] += angle * angle
@@ -374,6 +387,9 @@ def _track(
                     caught = energy * _caught(0.5 * angle if is_dish else angle, loop.disc)
                     total[ENERGY] += energy
                     total[CAUGHT] += caught
+                    if state[FRESH] > 0.0:
+                        total[FRESH_ENERGY] += energy
+                        total[FRESH_CAUGHT] += caught
                     if dark:
                         total[OUTAGE_ENERGY] += energy
                         total[OUTAGE_CAUGHT] += caught

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
+from rfpose.feedback.energy import Bursts, response_loss
 from rfpose.feedback.tracking import _kernels as kernels
 from rfpose.feedback.tracking.simulation import Sums
 
@@ -28,7 +29,7 @@ class Score:
     intercept
         Light caught over light that a perfect tracker would catch.
     energy_j_per_m2
-        Light caught by a square metre of mirror, from a clear sky.
+        Light caught by a square metre of mirror, from the sky as it was.
     motor_steps, motor_starts
         By mirror and day, both axes together.
     heliostat_rms_rad, heliostat_p95_rad, heliostat_worst_rad, heliostat_intercept : (mirror,)
@@ -41,6 +42,17 @@ class Score:
         While radio was out.
     outage_loss_j_per_m2
         Light spilt meanwhile, by mirror, beyond what is spilt at other times.
+    sunshine_s, bursts
+        Time with the sun out, and how often it came out, by mirror.
+    burst_error_rad
+        Mean error of the normal in the second in which the sun comes out; NaN if it never does.
+    response_loss
+        Part of the light offered that is spilt in the first `RESPONSE_S` after that, beyond what is spilt at other
+        times; negative where chance has it so, NaN if the sun never comes out.
+    response_loss_j_per_m2
+        The same light, by mirror.
+    turning_loss
+        Part of the sunshine that would pass if mirrors turned by the error at full speed (Edwards §5.4.9).
     lost_frames
         Part of the radio frames that brought nothing.
     out_of_reach
@@ -67,6 +79,12 @@ class Score:
     outage_rms_rad: float
     outage_intercept: float
     outage_loss_j_per_m2: float
+    sunshine_s: float
+    bursts: float
+    burst_error_rad: float
+    response_loss: float
+    response_loss_j_per_m2: float
+    turning_loss: float
     lost_frames: float
     out_of_reach: float
 
@@ -93,6 +111,15 @@ class Score:
                 "intercept": self.outage_intercept,
                 "loss_kwh_per_m2": self.outage_loss_j_per_m2 / 3.6e6,
             },
+            "sunshine": {
+                "hours": self.sunshine_s / 3600.0,
+                "bursts": self.bursts,
+                "error_mrad": 1e3 * self.burst_error_rad,
+                "response_window_s": kernels.RESPONSE_S,
+                "response_loss": self.response_loss,
+                "response_loss_kwh_per_m2": self.response_loss_j_per_m2 / 3.6e6,
+                "turning_loss": self.turning_loss,
+            },
             "lost_frames": self.lost_frames,
             "out_of_reach": self.out_of_reach,
         }
@@ -113,6 +140,9 @@ def score(sums: Sums) -> Score:
         everything[kernels.CAUGHT] - everything[kernels.OUTAGE_CAUGHT],
         everything[kernels.ENERGY] - everything[kernels.OUTAGE_ENERGY],
     )
+    fresh = everything[kernels.FRESH_ENERGY], everything[kernels.FRESH_CAUGHT]
+    settled = _ratio(everything[kernels.CAUGHT] - fresh[1], everything[kernels.ENERGY] - fresh[0])
+    lost_j = float((settled - _ratio(fresh[1], fresh[0])) * fresh[0])
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(by_mirror[:, kernels.SQUARE] / by_mirror[:, kernels.STEPS])
         by_day = np.sqrt(total[..., kernels.SQUARE] / total[..., kernels.STEPS])
@@ -144,6 +174,12 @@ def score(sums: Sums) -> Score:
         outage_loss_j_per_m2=float(max(lit - dark, 0.0) * everything[kernels.OUTAGE_ENERGY] / n_mirror)
         if np.isfinite(dark)
         else 0.0,
+        sunshine_s=float(everything[kernels.SUNSHINE]) / n_mirror,
+        bursts=float(everything[kernels.BURSTS]) / n_mirror,
+        burst_error_rad=_ratio(everything[kernels.BURST_ERROR], everything[kernels.BURSTS]),
+        response_loss=_ratio(lost_j, everything[kernels.ENERGY]),
+        response_loss_j_per_m2=lost_j / n_mirror,
+        turning_loss=_turning_loss(everything),
         lost_frames=_ratio(everything[kernels.FRAMES_LOST], everything[kernels.FRAMES]),
         out_of_reach=_ratio(
             everything[kernels.OUT_OF_REACH], everything[kernels.OUT_OF_REACH] + everything[kernels.STEPS]
@@ -162,6 +198,14 @@ def quantile(histogram: npt.NDArray[np.int64], part: float) -> FloatArray:
         inside = (wanted[:, 0] - below) / histogram[row, slot]
         value = kernels.LOWEST_RAD * 10.0 ** ((slot + inside) / kernels.BINS_PER_DECADE)
     return np.asarray(np.where(cumulated[:, -1] > 0, value, np.nan))
+
+
+def _turning_loss(sums: FloatArray) -> float:
+    """Edwards §5.4.9 with the sunshine, the bursts and the errors of this run."""
+    if not sums[kernels.BURSTS] > 0.0:
+        return float("nan")
+    sky = Bursts(sunshine_h=float(sums[kernels.SUNSHINE]) / 3600.0, per_year=float(sums[kernels.BURSTS]))
+    return float(response_loss(sums[kernels.TURNING] / sums[kernels.BURSTS], bursts=sky))
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -21,6 +21,7 @@ from rfpose.feedback.tracking.instruments import LEARNED, Workshop
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import Day, days
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
@@ -149,7 +150,7 @@ class Simulation:
         plan = scenario.tracking
         self.scenario, self.seed = scenario, int(seed)
         self.methods = choose(methods, collector=plan.collector)
-        self.days: tuple[Day, ...] = days(scenario)
+        self.days: tuple[Day, ...] = under_sky(scenario, days(scenario), seed=self.seed)
         course = self.days[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
         self.field: Field = draw_field(scenario, count=count, seed=self.seed, sun_enu=course)
         self.gusts = Gusts(scenario)

@@ -35,7 +35,7 @@ class Day:
     sun_enu : (step + lead, xyz)
         Towards the sun; goes on beyond the last step, for commands ahead of time.
     power_w_per_m2 : (step,)
-        Beam of the sun under a clear sky [W/m²].
+        Beam of the sun, under a clear sky unless `sky.under_sky` has laid clouds on it [W/m²].
     hour : (step,)
         Local mean solar time [h].
     """
