@@ -23,6 +23,7 @@ from rfpose.pipeline.simulate import simulate_recording
 from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.export import open_window, png_of, settle
+from rfpose.viewer.views.live import LiveView
 
 SCALED = "viewer_field_200_percent.png"
 
@@ -72,6 +73,25 @@ def shoot(path: Path, output: Path, *, view: str, theme: str = "light", frame: i
     print(output)
 
 
+def live(path: Path, output: Path) -> None:
+    """Write a picture of a live field in which a transmitter is off the air and a mirror's motors stand."""
+    app, window = open_window(path)
+    window.go_to("live")
+    settle(app, window)
+    view = window.views["live"]
+    assert isinstance(view, LiveView)
+    for what, name, n_step in (("kill_transmitter", "T10", 75), ("stop_motor", "H05", 45), ("gust", "", 5)):
+        view.disturb(what, name)
+        view.toggle()  # halted, so that the picture does not depend on how fast the computer is
+        settle(app, window)
+        view.advance(n_step)
+        settle(app, window)
+    output.write_bytes(png_of(window))
+    window.close()
+    app.processEvents()
+    print(output)
+
+
 def welcome(output: Path, path: Path) -> None:
     """Write a picture of the first page."""
     app, window = open_window(path)
@@ -111,6 +131,9 @@ def main() -> None:
         shoot(large_site(folder), out / "viewer_layout.png", view="layout")
         shoot(scenario, out / "viewer_layout_dark.png", view="layout", theme="dark")
         shoot(day, out / "viewer_tracking.png", view="tracking", frame=150)
+        tracked = Path("tracking_100m.toml")
+        tracked.write_text(shipped_scenario(tracked.name).read_text())
+        live(tracked, out / "viewer_live.png")
         subprocess.run(
             [sys.executable, str(Path(__file__).resolve()), "--output", str(out), "--scaled", str(result)],
             env=os.environ | {"QT_SCALE_FACTOR": "2"},

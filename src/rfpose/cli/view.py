@@ -10,7 +10,7 @@ from rfpose.cli._support import common_options, emit_json, examples, force_optio
 
 __all__ = ["command"]
 
-VIEW_NAMES = ("recording", "field", "layout", "tracking")
+VIEW_NAMES = ("recording", "field", "layout", "tracking", "live")
 THEMES = ("light", "dark")
 
 

@@ -11,7 +11,7 @@ from rfpose.checks import FloatArray
 from rfpose.geometry import unit
 from rfpose.pipeline.track_file import Track
 
-__all__ = ["Instant", "TrackPicture", "picture_of_track"]
+__all__ = ["Instant", "TrackPicture", "instant_at", "picture_of_track"]
 
 _DAY_GAP_S = 3600.0
 """Between two simulated days the curves show a gap of this length, whatever lies between them."""
@@ -80,23 +80,12 @@ class TrackPicture:
     def at(self, method: str, instant: int) -> Instant:
         """Return what a method's mirrors did at an instant."""
         series = self.track.methods[method].series
-        normal = np.asarray(series["normal_enu"][instant], np.float64)
-        sun = self.track.sun_enu[instant]
-        ray = 2.0 * (normal @ sun)[:, None] * normal - sun
-        ahead = self.target_enu_m - self.pivot_enu_m
-        distance = np.linalg.norm(ahead, axis=1, keepdims=True)
-        along = unit(ahead)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            towards = np.einsum("mx,mx->m", ray, along)[:, None]
-            end = self.pivot_enu_m + ray * np.where(towards > 0.05, distance / towards, np.nan)
-        right = unit(np.cross(along, [0.0, 0.0, 1.0]))
-        up = np.cross(right, along)
-        miss = end - self.target_enu_m
-        return Instant(
-            normal_enu=normal,
-            error_mrad=1e3 * np.asarray(series["error_rad"][instant], np.float64),
-            beam_end_enu_m=end,
-            spot_m=np.stack([np.einsum("mx,mx->m", miss, right), np.einsum("mx,mx->m", miss, up)], axis=1),
+        return instant_at(
+            np.asarray(series["normal_enu"][instant], np.float64),
+            np.asarray(series["error_rad"][instant], np.float64),
+            self.track.sun_enu[instant],
+            self.pivot_enu_m,
+            self.target_enu_m,
         )
 
     def comparison(self, instant: int) -> list[tuple[str, float, float, float, float, float]]:
@@ -116,6 +105,32 @@ class TrackPicture:
                 )
             )
         return rows
+
+
+def instant_at(
+    normal_enu: FloatArray,
+    error_rad: FloatArray,
+    sun_enu: FloatArray,
+    pivot_enu_m: FloatArray,
+    target_enu_m: FloatArray,
+) -> Instant:
+    """Return mirrors with these normals (mirror, xyz) and errors (mirror,), and where their beams go."""
+    ray = 2.0 * (normal_enu @ sun_enu)[:, None] * normal_enu - sun_enu
+    ahead = target_enu_m - pivot_enu_m
+    distance = np.linalg.norm(ahead, axis=1, keepdims=True)
+    along = unit(ahead)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        towards = np.einsum("mx,mx->m", ray, along)[:, None]
+        end = pivot_enu_m + ray * np.where(towards > 0.05, distance / towards, np.nan)
+    right = unit(np.cross(along, [0.0, 0.0, 1.0]))
+    up = np.cross(right, along)
+    miss = end - target_enu_m
+    return Instant(
+        normal_enu=normal_enu,
+        error_mrad=1e3 * error_rad,
+        beam_end_enu_m=end,
+        spot_m=np.stack([np.einsum("mx,mx->m", miss, right), np.einsum("mx,mx->m", miss, up)], axis=1),
+    )
 
 
 def _largest(values: FloatArray) -> float:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["FORMATS", "VIEW_NAMES", "export", "open_window", "save_widget", "settle"]
 
 FORMATS = (".png", ".svg", ".html")
-VIEW_NAMES = ("recording", "field", "layout", "tracking")
+VIEW_NAMES = ("recording", "field", "layout", "tracking", "live")
 _TIMEOUT_S = 300.0
 _QUIET_S = 0.35
 """Longer than any timer that views start work by."""

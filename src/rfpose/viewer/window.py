@@ -34,6 +34,7 @@ from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import apply, theme_of
 from rfpose.viewer.views.field import FieldView
 from rfpose.viewer.views.layout import LayoutView
+from rfpose.viewer.views.live import LiveView
 from rfpose.viewer.views.parts import View
 from rfpose.viewer.views.recording import RecordingView
 from rfpose.viewer.views.tracking import TrackingView
@@ -42,14 +43,14 @@ from rfpose.viewer.workers import Workers
 
 __all__ = ["VIEWS", "MainWindow"]
 
-VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView, TrackingView)
+VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView, TrackingView, LiveView)
 _FIRST_VIEW = {"recording": "recording", "result": "field", "scenario": "layout", "track": "tracking"}
 _FILES = "All of ours (*.h5 *.hdf5 *.toml *.sigmf-meta *.sigmf-data);;All files (*)"
 _BUSY_AFTER_MS = 250
 _KEYS = (
     ("Ctrl+O, Ctrl+Shift+O", "open a file, a directory"),
     ("F5", "read the open file again"),
-    ("Ctrl+1 … Ctrl+4", "go to a view"),
+    ("Ctrl+1 … Ctrl+5", "go to a view"),
     ("Page Up, Page Down", "frame before, frame after"),
     ("Space", "play, pause (tracking)"),
     ("[ and ]", "transmitter before, transmitter after"),
@@ -413,7 +414,7 @@ class MainWindow(QMainWindow):
         self.message_label.setText(html.escape(message.text))
 
     def _show_busy(self) -> None:
-        jobs = [job for job in self.workers.jobs if job.name not in ("Map", "Getting ready")]
+        jobs = [job for job in self.workers.jobs if job.name not in ("Map", "Getting ready", "Live")]
         for widget in (self.busy_label, self.busy_bar, self.busy_cancel):
             widget.setVisible(bool(jobs))
         if jobs:
