@@ -99,6 +99,20 @@ def test_buttons_disturb_the_field(view: LiveView, window: MainWindow, wait: Wai
     assert [text for _, text in live.marks] == ["kill T7", "stop H02", "gust", "emergency", "normal"]
 
 
+def test_cancelled_work_halts_time_and_it_can_go_on(view: LiveView, window: MainWindow, qtbot) -> None:
+    live = view.live
+    assert live is not None
+    view.factor.setCurrentIndex(view.factor.count() - 1)
+    view._set_factor()
+    view.run_button.click()
+    qtbot.waitUntil(lambda: any(job.name == "Live" for job in window.workers.jobs), timeout=20_000)
+    window.cancel()
+    qtbot.waitUntil(lambda: not live.running, timeout=20_000)
+    halted = live.now_s
+    view.run_button.click()
+    qtbot.waitUntil(lambda: live.now_s > halted, timeout=20_000)
+
+
 def test_another_file_ends_it(view: LiveView, window: MainWindow, files: dict[str, Path], wait: Wait) -> None:
     view.run_button.click()
     window.open_path(files["result"])

@@ -16,7 +16,7 @@ from rfpose.viewer.state.live import FACTORS, LiveRun
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.parts import Dots, Scale, Table, View, plot_in, segments
-from rfpose.viewer.workers import Workers
+from rfpose.viewer.workers import Job, Workers
 
 __all__ = ["LiveView"]
 
@@ -37,7 +37,8 @@ class LiveView(View):
     def __init__(self, session: Session, workers: Workers, theme: Theme) -> None:
         super().__init__(session, workers, theme)
         self.live: LiveRun | None = None
-        self._asked = self._stepping = False
+        self._asked = False
+        self._job: Job | None = None
         self._lines: list[Any] = []
         self._build()
         self._clock = QTimer(self, interval=_TICK_MS)
@@ -147,7 +148,7 @@ class LiveView(View):
     def _on_opened(self) -> None:
         self._clock.stop()
         self.workers.cancel(_WORK)
-        self.live, self._asked, self._stepping = None, False, False
+        self.live, self._asked, self._job = None, False, None
         self._enable(False)
         if self.isVisible() and self.applies():
             self.start()
@@ -159,22 +160,23 @@ class LiveView(View):
             return
         scenario = document.scenario
         self._clock.stop()
-        self._asked, self._stepping, self.live = True, True, None
+        self._asked, self.live = True, None
         self._enable(False)
+        self.again_button.setEnabled(True)
         self.moment.setText("making the field ready …")
 
         def work(on_progress: Any) -> tuple[LiveTrack, LivePicture | None]:
             track = LiveTrack(scenario)
             return track, track.advance(_FIRST_STEPS, on_progress)
 
-        self.workers.run(_WORK, work, self._started, failed=self._failed)
+        self._job = self.workers.run(_WORK, work, self._started, failed=self._failed)
 
     def _started(self, found: tuple[LiveTrack, LivePicture | None]) -> None:
         track, picture = found
         self.live = LiveRun(track)
         self.live.factor = float(self.factor.currentData())
         self.live.changed.connect(self._draw)
-        self._stepping = False
+        self._job = None
         for box, names in ((self.transmitter, track.transmitter_ids), (self.mirror, track.ids)):
             box.clear()
             box.addItems(list(names))
@@ -183,7 +185,7 @@ class LiveView(View):
         self.live.take(picture)
 
     def _failed(self, text: str) -> None:
-        self._stepping = False
+        self._job = None
         self.moment.setText("")
         self.session.tell(text, is_error=True)
 
@@ -207,7 +209,12 @@ class LiveView(View):
     def _tick(self) -> None:
         now = time.monotonic()
         elapsed, self._last = now - self._last, now
-        if self.live is None or self._stepping:
+        if self.live is None:
+            return
+        if self._job is not None:
+            if self._job.is_cancelled:  # by the window: time halts
+                self._job = None
+                self.live.toggle()
             return
         n = self.live.due(elapsed)
         if n:
@@ -218,13 +225,12 @@ class LiveView(View):
         live = self.live
         if live is None:
             return
-        self._stepping = True
-        self.workers.run(
+        self._job = self.workers.run(
             _WORK, lambda tell: live.track.advance(n_step, tell), lambda p: self._stepped(live, p), failed=self._failed
         )
 
     def _stepped(self, live: LiveRun, picture: LivePicture | None) -> None:
-        self._stepping = False
+        self._job = None
         live.take(picture)
 
     def _mirror_chosen(self) -> None:
