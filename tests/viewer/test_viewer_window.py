@@ -527,6 +527,26 @@ def test_error_in_work_becomes_a_message(window: MainWindow, qtbot, error: Excep
     assert window.session.message is None
 
 
+def test_garbage_is_collected_in_the_windows_thread_only(window: MainWindow, qtbot) -> None:
+    # elsewhere a Qt object in a cycle would end outside its thread, which aborts the program now and then
+    ended: list[threading.Thread] = []
+
+    class Knot:
+        def __init__(self) -> None:
+            self.itself = self
+
+        def __del__(self) -> None:
+            ended.append(threading.current_thread())
+
+    def work(progress: Callable[[int, int], None]) -> None:
+        for _ in range(20_000):
+            Knot()
+
+    window.workers.run("Knots", work, lambda _: None)
+    qtbot.waitUntil(lambda: len(ended) > 1000, timeout=30_000)
+    assert set(ended) == {threading.main_thread()}
+
+
 def test_theme_changes_over_the_same_state(window: MainWindow, laid_out: LayoutView, wait: Wait) -> None:
     window.session.layout.move("T1", east=70.0)
     wait(window)

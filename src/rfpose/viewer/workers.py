@@ -1,13 +1,18 @@
-"""Long work beside the window: each job in a thread of its own, its end told in the window's thread."""
+"""Long work beside the window: each job in a thread of its own, its end told in the window's thread.
+
+Python collects cyclic garbage in whatever thread happens to allocate. Windows and pictures are full of cycles, and Qt
+objects must not end outside the window's thread; so while there are workers, garbage is collected there and only there.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import gc
 import threading
 from collections.abc import Callable
 from typing import Any
 
-from PySide6.QtCore import QObject, Qt, Signal, Slot
+from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
 from rfpose.errors import RfposeError
 
@@ -15,6 +20,12 @@ __all__ = ["CancelledError", "Job", "Workers"]
 
 Progress = Callable[[int, int], None]
 Work = Callable[[Progress], Any]
+
+_COLLECT_EVERY_MS = 200
+_RUNNING: set[Job] = set()
+"""Jobs whose end has not been told: no window owns them, so that none takes one away from its thread."""
+_OPEN: set[int] = set()
+"""Workers that have not been stopped."""
 
 
 class CancelledError(Exception):
@@ -29,10 +40,8 @@ class Job(QObject):
     _told = Signal(int, int)
     _left = Signal()
 
-    def __init__(
-        self, name: str, work: Work, done: Callable[[Any], None], failed: Callable[[str], None], parent: QObject
-    ) -> None:
-        super().__init__(parent)
+    def __init__(self, name: str, work: Work, done: Callable[[Any], None], failed: Callable[[str], None]) -> None:
+        super().__init__()
         self.name = name
         self._work, self._done, self._failed = work, done, failed
         self._cancelled = threading.Event()
@@ -44,6 +53,7 @@ class Job(QObject):
 
     def start(self) -> None:
         """Begin."""
+        _RUNNING.add(self)
         self._thread.start()
 
     def cancel(self) -> None:
@@ -74,7 +84,7 @@ class Job(QObject):
             self._problem = f"{place}{error.strerror or error}; check the file and its disk"
         except Exception as error:  # noqa: BLE001 -- a job's end must reach the window, whatever it is
             self._problem = f"{self.name}: unexpected {type(error).__name__}: {error}; please report this"
-        with contextlib.suppress(RuntimeError):  # the window has gone
+        with contextlib.suppress(RuntimeError):  # the program ends
             self._left.emit()
 
     def _progress(self, done: int, total: int) -> None:
@@ -90,6 +100,8 @@ class Job(QObject):
 
     @Slot()
     def _on_left(self) -> None:
+        self._thread.join()  # it may still be on its way out of the signal
+        _RUNNING.discard(self)
         self.ended.emit()
         if self._cancelled.is_set():
             return
@@ -113,6 +125,11 @@ class Workers(QObject):
         self._jobs: list[Job] = []
         self._by_key: dict[str, Job] = {}
         self._closed = False
+        self._garbage = QTimer(self)
+        self._garbage.timeout.connect(_collect)
+        self._garbage.start(_COLLECT_EVERY_MS)
+        _OPEN.add(id(self))
+        gc.disable()
 
     @property
     def jobs(self) -> tuple[Job, ...]:
@@ -132,7 +149,7 @@ class Workers(QObject):
         key = key or name
         if key in self._by_key:
             self._by_key[key].cancel()
-        job = Job(name, work, done, failed or self._failed, self)
+        job = Job(name, work, done, failed or self._failed)
         job.ended.connect(lambda: self._forget(job, key))
         self._jobs.append(job)
         self._by_key[key] = job
@@ -155,6 +172,9 @@ class Workers(QObject):
         self._closed = True
         self.cancel()
         waited = [job.wait(timeout_s) for job in tuple(self._jobs)]
+        _OPEN.discard(id(self))
+        if not _OPEN and all(waited):
+            gc.enable()
         return all(waited)
 
     def _forget(self, job: Job, key: str) -> None:
@@ -163,4 +183,15 @@ class Workers(QObject):
         if self._by_key.get(key) is job:
             del self._by_key[key]
         job.deleteLater()
-        self.changed.emit()
+        with contextlib.suppress(RuntimeError):  # the window has gone
+            self.changed.emit()
+
+
+def _collect() -> None:
+    """Collect the oldest generation whose time has come, as Python does by itself."""
+    for generation, (count, threshold) in reversed(
+        list(enumerate(zip(gc.get_count(), gc.get_threshold(), strict=True)))
+    ):
+        if count > threshold:
+            gc.collect(generation)
+            return
