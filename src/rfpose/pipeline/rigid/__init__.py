@@ -1,0 +1,63 @@
+"""Rigid poses of a recording's mirrors by the chosen estimator: direct or two-ray, guarded, delays learned."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+
+from rfpose.dsp import Calibration, TonePhases
+from rfpose.multilat import RangeDifferences
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.mirrors import mirror_groups
+from rfpose.pipeline.result_file import FixTable, PoseTable
+from rfpose.pipeline.rigid.direct import solve_direct
+from rfpose.pipeline.rigid.found import Stages
+from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
+from rfpose.pipeline.rigid.two_ray import solve_two_ray
+from rfpose.scenario import Scenario
+
+__all__ = ["RigidOutcome", "solve_rigid_poses"]
+
+
+def solve_rigid_poses(
+    tones: TonePhases,
+    calibration: Calibration,
+    ranges: RangeDifferences,
+    fixes: FixTable,
+    independent: PoseTable,
+    scenario: Scenario,
+    choice: PoseChoice,
+    *,
+    sample_rate: Fraction,
+) -> RigidOutcome:
+    """Solve every mirror of every frame as a rigid body.
+
+    The coarsest tone comes first, finer tones and the carrier follow where their whole wavelengths are safe. The
+    carrier is used between receivers on one oscillator.
+
+    Parameters
+    ----------
+    tones, calibration, ranges, fixes
+        The stages before.
+    independent
+        Normals of separately located receivers: where a mirror cannot be solved as a whole, its status.
+    scenario
+        The site.
+    choice
+        The estimator; its ``pose`` is ``rigid``.
+    sample_rate
+        Of the recording, for the time between frames [1/s].
+    """
+    stages = Stages(tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice)
+    tables = Tables(stages, independent)
+    start = tones.frame_start_index
+    time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
+    for group in mirror_groups(scenario):
+        found = solve_two_ray(stages, group) if choice.reflection != "none" else solve_direct(stages, group)
+        if group.learns_delays:
+            found = tables.put_delays(group, found, time_s)
+        tables.put(group, found)
+        if choice.filtered:
+            tables.put_filtered(group, found, time_s, exposure_s=float(scenario.radio.frame_samples / sample_rate))
+    return tables.outcome()

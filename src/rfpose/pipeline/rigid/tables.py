@@ -1,0 +1,287 @@
+"""The result's tables, filled group by group: poses, integrity, reflection, delays, filtered poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.geometry import azimuth_elevation_from_enu
+from rfpose.multilat import Motion, PoseStatus, TrackStatus, track_poses
+from rfpose.multilat.integrity import IntegrityStatus
+from rfpose.multilat.rigid import full_covariance
+from rfpose.multilat.rigid.delays import learn_delays
+from rfpose.multilat.rigid.integers import IntegerMethod, Observation
+from rfpose.pipeline.mirrors import (
+    MirrorGroup,
+    mirror_groups,
+)
+from rfpose.pipeline.result_file import (
+    DelayTable,
+    FilteredTable,
+    IntegrityTable,
+    PoseTable,
+    ReflectionTable,
+)
+from rfpose.pipeline.rigid.found import (
+    BoolArray,
+    Found,
+    IntArray,
+    Stages,
+)
+from rfpose.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigidOutcome:
+    """Poses, and what else their estimator found; None where it does not look for it."""
+
+    poses: PoseTable
+    integrity: IntegrityTable | None
+    reflection: ReflectionTable | None
+    delays: DelayTable | None
+    filtered: FilteredTable | None
+
+
+class Tables:
+    """The result's tables, filled group by group."""
+
+    def __init__(self, stages: Stages, independent: PoseTable) -> None:
+        self._stages = stages
+        scenario, choice = stages.scenario, stages.choice
+        n_frame = self._n_frame = len(stages.tones.frame_start_index)
+        frame_mirror = (n_frame, len(scenario.heliostat))
+        n_receiver, n_transmitter = len(scenario.receivers), len(scenario.transmitter)
+        self._poses = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
+        for values in self._poses.values():
+            if values.dtype.kind == "f":
+                values[:] = np.nan
+        self._integrity: dict[str, npt.NDArray[Any]] = {}
+        if choice.integrity:
+            self._integrity = {
+                "status": np.full(frame_mirror, IntegrityStatus.NOT_SOLVED, np.int8),
+                "transmitter_status": np.zeros((*frame_mirror, n_transmitter), np.int8),
+                "used": np.zeros((n_frame, n_receiver, n_transmitter), np.bool_),
+                "prior_rejected": np.zeros((*frame_mirror, 3), np.bool_),
+                "prior_testable": np.zeros((*frame_mirror, 3), np.bool_),
+                "probability_all": np.full(frame_mirror, np.nan),
+                "probability": np.full(frame_mirror, np.nan),
+                "protection_level_rad": np.full(frame_mirror, np.nan),
+                "worst_transmitter": np.full(frame_mirror, -1, np.int16),
+            }
+        self._reflection: dict[str, npt.NDArray[Any]] = {}
+        if choice.reflection != "none":
+            n_plane = 1 + len(scenario.reflection.plane)
+            self._reflection = {
+                "coefficient": np.full((*frame_mirror, n_plane), np.nan, np.complex128),
+                "coefficient_sigma": np.full((*frame_mirror, n_plane, 2), np.nan),
+                "probability_direct": np.full(frame_mirror, np.nan),
+            }
+        self._filtered: dict[str, npt.NDArray[Any]] = {}
+        if choice.filtered:
+            self._filtered = {
+                name: np.full((*frame_mirror, *shape), np.nan)
+                for name, shape in (
+                    ("normal_enu", (3,)),
+                    ("cov_enu", (3, 3)),
+                    ("sigma_rad", ()),
+                    ("pivot_enu_m", (3,)),
+                    ("rate_enu_radps", (3,)),
+                )
+            }
+            self._filtered["status"] = np.full(frame_mirror, TrackStatus.UNKNOWN, np.int8)
+        self._delays: dict[str, npt.NDArray[Any]] = {}
+        if any(group.learns_delays for group in mirror_groups(scenario)):
+            n_clock = len(scenario.tone) + 1
+            self._delays = {
+                "delay_s": np.full((n_frame, n_receiver, n_clock), np.nan),
+                "sigma_s": np.full((n_frame, n_receiver, n_clock), np.nan),
+                "jumped": np.zeros(frame_mirror, np.bool_),
+            }
+
+    def put(self, group: MirrorGroup, found: Found) -> None:
+        """Write one group's poses and tests."""
+        poses = found.poses
+        normal = poses.normal_enu
+        azimuth, elevation = azimuth_elevation_from_enu(normal)
+        cross = _cross_matrix(normal)
+        places = np.tile(group.places_m, (self._n_frame, 1, 1))
+        self._put(
+            self._poses,
+            group,
+            {
+                "normal_enu": normal,
+                "cov_enu": cross @ poses.cov[:, 3:, 3:] @ cross.swapaxes(1, 2),
+                "sigma_rad": poses.tilt_sigma_rad,
+                "azimuth_rad": azimuth,
+                "elevation_rad": elevation,
+                "centre_enu_m": poses.pivot_enu_m
+                + np.einsum("mab,mb->ma", poses.rot_enu_from_mirror, places.mean(axis=1)),
+                "n_receiver": np.where(np.isfinite(normal[:, 0]), group.rows.shape[1], 0),
+                "n_wavelength": found.fixed.sum(axis=1),
+                "integer_method": self._methods(group, found),
+                "integer_risk": np.where(found.fixed, found.wrong_risk, 0.0).max(axis=1),
+                "status": found.status,
+            },
+        )
+        guard = found.guard
+        if self._integrity and guard is not None:
+            level = np.where(np.isfinite(normal[:, 0]), guard.protection_level_rad, np.nan)
+            self._put(
+                self._integrity,
+                group,
+                {
+                    "status": guard.status,
+                    "transmitter_status": guard.transmitter_status,
+                    "prior_rejected": guard.prior_rejected,
+                    "prior_testable": guard.prior_testable,
+                    "probability_all": found.probability_all,
+                    "probability": guard.chi2_probability,
+                    "protection_level_rad": level,
+                    "worst_transmitter": guard.worst_transmitter,
+                },
+            )
+            used = guard.used & np.isfinite(normal[:, :1, None])
+            self._integrity["used"][:, group.rows] = used.reshape(self._n_frame, *group.rows.shape, -1)
+        if self._reflection:
+            names = ("coefficient", "coefficient_sigma", "probability_direct")
+            self._put(self._reflection, group, {name: getattr(found, name) for name in names})
+
+    def _methods(self, group: MirrorGroup, found: Found) -> IntArray:
+        """(mirror, clock) how integers were found; what a pose that failed rests on says nothing."""
+        out = np.full((len(found.method), len(self._stages.scenario.tone) + 1), IntegerMethod.FLOAT, np.int64)
+        out[:, : found.method.shape[1]] = np.where(np.isfinite(found.poses.tilt_sigma_rad)[:, None], found.method, 0)
+        return out
+
+    def put_filtered(self, group: MirrorGroup, found: Found, time_s: FloatArray, *, exposure_s: float) -> None:
+        """Filter a group's poses over frames and write them; poses that are doubted are left out."""
+
+        def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            return array.reshape(self._n_frame, len(group.column), *array.shape[1:])
+
+        poses, table = found.poses, self._stages.scenario.motion
+        tracked = track_poses(
+            by_frame(poses.pivot_enu_m),
+            by_frame(poses.rot_enu_from_mirror),
+            by_frame(poses.cov),
+            time_s=time_s + 0.5 * exposure_s,
+            exposure_s=exposure_s,
+            usable=by_frame(found.status == PoseStatus.OK),
+            motion=Motion(
+                rate_walk_radps_per_sqrt_s=table.rate_walk_radps_per_sqrt_s,
+                rate_sigma_radps=table.rate_sigma_radps,
+                gate_probability=table.gate_probability,
+                restart_after=table.restart_after,
+                max_coast_s=np.inf if table.max_coast_s is None else table.max_coast_s,
+            ),
+        )
+        cross = _cross_matrix(tracked.normal_enu)
+        values = {
+            "normal_enu": tracked.normal_enu,
+            "cov_enu": cross @ tracked.cov[..., 3:6, 3:6] @ cross.swapaxes(-1, -2),
+            "sigma_rad": tracked.tilt_sigma_rad,
+            "pivot_enu_m": tracked.pivot_enu_m,
+            "rate_enu_radps": tracked.rate_enu_radps,
+            "status": tracked.status,
+        }
+        for name, array in values.items():
+            self._filtered[name][:, group.column] = array
+
+    def _put(self, table: dict[str, npt.NDArray[Any]], group: MirrorGroup, values: dict[str, Any]) -> None:
+        for name, array in values.items():
+            table[name][:, group.column] = array.reshape(self._n_frame, len(group.column), *array.shape[1:])
+
+    def put_delays(self, group: MirrorGroup, found: Found, time_s: FloatArray) -> Found:
+        """Learn the delays of a group over frames, write them, and return its poses refined by them."""
+        scenario = self._stages.scenario
+        speed = scenario.radio.propagation_speed_mps
+        n_frame, n_helio = self._n_frame, len(group.column)
+        poses, whole = found.poses, _with_clocks(scenario, group, found, n_frame)
+        # poses that are doubted, or rest on fewer priors than the rest, teach nothing
+        whole[found.status != PoseStatus.OK] = np.nan
+        if found.guard is not None:
+            whole[found.guard.prior_rejected.any(axis=1)] = np.nan
+        n_class = poses.clock_m.shape[1]
+        observed = _observed_clocks(found.ranges, n_class)
+
+        def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+            return array.reshape(n_frame, n_helio, *array.shape[1:])
+
+        learned = learn_delays(
+            by_frame(poses.pivot_enu_m),
+            by_frame(poses.rot_enu_from_mirror),
+            by_frame(np.where(observed, poses.clock_m, 0.0)),
+            by_frame(whole),
+            time_s=time_s,
+            drift_m_per_sqrt_s=group.drift_m_per_sqrt_s(scenario),
+            observed=by_frame(observed),
+        )
+        n_receiver = group.rows.shape[1]
+        shape = (n_frame, n_helio, n_class, n_receiver - 1)
+        variance = np.einsum("fmdd->fmd", learned.difference_cov_m2).reshape(shape)
+        for name, values in (("delay_s", learned.difference_m.reshape(shape)), ("sigma_s", np.sqrt(variance))):
+            known = np.isfinite(values) & (variance < learned.unseen_m**2 / 2.0)
+            rows = np.where(known, values / speed, np.nan).swapaxes(2, 3)
+            self._delays[name][:, group.rows[:, 1:], :n_class] = rows
+            self._delays[name][:, group.rows[:, 0], :n_class] = np.where(known.any(axis=3), 0.0, np.nan)
+        self._delays["jumped"][:, group.column] = learned.jumped
+        refined = np.isfinite(learned.cov).all(axis=(2, 3)).reshape(-1)
+        values = {
+            "pivot_enu_m": learned.pivot_enu_m,
+            "rot_enu_from_mirror": learned.rot_enu_from_mirror,
+            "cov": learned.cov,
+        }
+        arrays = {}
+        for name, array in values.items():
+            flat = array.reshape(n_frame * n_helio, *array.shape[2:])
+            arrays[name] = np.where(refined.reshape(-1, *[1] * (flat.ndim - 1)), flat, getattr(poses, name))
+        return replace(found, poses=replace(poses, **arrays))
+
+    def outcome(self) -> RigidOutcome:
+        """Return the tables, those that were asked for."""
+        return RigidOutcome(
+            poses=PoseTable(**self._poses),
+            integrity=IntegrityTable(**self._integrity) if self._integrity else None,
+            reflection=ReflectionTable(**self._reflection) if self._reflection else None,
+            delays=DelayTable(**self._delays) if self._delays else None,
+            filtered=FilteredTable(**self._filtered) if self._filtered else None,
+        )
+
+
+def _with_clocks(scenario: Scenario, group: MirrorGroup, found: Found, n_frame: int) -> FloatArray:
+    """Covariance of pose and clocks of every mirror."""
+    if found.full_cov is not None:
+        return np.array(found.full_cov)
+    phases = found.ranges
+    return np.array(
+        full_covariance(
+            scenario.transmitter_enu_m,
+            np.tile(group.places_m, (n_frame, 1, 1)),
+            np.nan_to_num(found.poses.pivot_enu_m),
+            np.nan_to_num(found.poses.rot_enu_from_mirror),
+            sigma_m=np.stack([np.where(np.isfinite(o.range_m), o.sigma_m, np.nan) for o in phases], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in phases], axis=1),
+            clock_class=[o.clock_class for o in phases],
+            knowledge=found.known,
+        )
+    )
+
+
+def _observed_clocks(phases: list[Observation], n_class: int) -> BoolArray:
+    """(mirror, class, receiver) whether any range tells of a clock."""
+    out = np.zeros((len(phases[0].range_m), n_class, phases[0].range_m.shape[1]), np.bool_)
+    for phase in phases:
+        out[:, phase.clock_class] |= np.isfinite(phase.range_m).any(axis=2)
+    return out
+
+
+def _cross_matrix(v: FloatArray) -> FloatArray:
+    """(…, 3, 3) with ``m @ x = v × x``."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
