@@ -203,6 +203,15 @@ def test_demo_writes_a_report(directory: Path, tmp_path: Path) -> None:
     assert "data:image/png;base64" in report
 
 
+def test_demo_makes_its_directory_and_all_it_promises(tmp_path: Path) -> None:
+    told = _json("demo", "-o", tmp_path / "new" / "demo")
+    names = {"recording.h5", "result.h5", "poses.csv", "field_map.png", "spectrum.png", "report.html"}
+    assert {Path(path).name for path in told["files"].values()} == names
+    assert all(Path(path).is_file() for path in told["files"].values())
+    assert told["solved"] == 60
+    (tmp_path / "new" / "demo" / "recording.h5").unlink()  # 300 MB
+
+
 @pytest.mark.parametrize("name", ["spectrum.png", "report.html"])
 def test_demo_refuses_what_is_there_before_any_work(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("dear")

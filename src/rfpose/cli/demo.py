@@ -31,7 +31,8 @@ def command(output: Path, seed: int, force: bool) -> None:
     from rfpose.pipeline.files import refuse_existing
 
     report = output / "report.html"
-    refuse_existing(report, force=force)
+    if output.is_dir():
+        refuse_existing(report, force=force)
     with progress("Preparing") as shown:
         outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage)
         shown.stage("Writing the report")
