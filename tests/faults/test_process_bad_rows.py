@@ -14,7 +14,8 @@ from rfpose.dsp import CalibrationStatus, LineStatus
 from rfpose.errors import GeometryError, InvalidInputError, RecordingError, ScenarioError
 from rfpose.multilat import FixStatus, PoseStatus
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import Result, summarise
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_summary import summarise
 from rfpose.recording import RecordingWriter
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.simulate import Chunk, Simulator

@@ -13,7 +13,7 @@ import pytest
 
 from rfpose.pipeline.evaluate import Evaluation, evaluate, read_truth
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import Result
+from rfpose.pipeline.result import Result
 from rfpose.pipeline.simulate import simulate_recording
 from rfpose.scenario import Scenario, load_scenario
 

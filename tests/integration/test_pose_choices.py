@@ -17,7 +17,9 @@ from rfpose.pipeline.choice import PoseChoice, choose
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import Result, read_result, summarise, write_result
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_file import read_result, write_result
+from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.simulate import simulate_recording
 from rfpose.pipeline.solve import check_solvable
 from rfpose.scenario import Scenario, load_scenario

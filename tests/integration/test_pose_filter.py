@@ -14,7 +14,9 @@ from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.inspect import inspect_file
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import Result, read_result, summarise
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.simulate import simulate_recording
 from rfpose.scenario import Scenario, load_scenario
 

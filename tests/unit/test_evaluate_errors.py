@@ -14,7 +14,8 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.multilat import PoseStatus, joint_covariance, mirror_normal
 from rfpose.pipeline.evaluate import Statistics, evaluate, read_truth
-from rfpose.pipeline.result_file import Result, write_result
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_file import write_result
 from rfpose.pipeline.solve import solve
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.scenario import Scenario, load_scenario

@@ -18,17 +18,9 @@ import pytest
 from rfpose.dsp import TonePhases
 from rfpose.errors import RecordingError
 from rfpose.pipeline import result_file
-from rfpose.pipeline.result_file import (
-    CSV_COLUMNS,
-    KEYS,
-    Result,
-    frame_time,
-    is_result,
-    read_result,
-    summarise,
-    write_poses_csv,
-    write_result,
-)
+from rfpose.pipeline.result import Result, frame_time
+from rfpose.pipeline.result_file import KEYS, is_result, read_result, write_result
+from rfpose.pipeline.result_summary import CSV_COLUMNS, summarise, write_poses_csv
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.truth import Truth

@@ -99,7 +99,7 @@ def command(
     """
     from rfpose.pipeline.files import refuse_existing
     from rfpose.pipeline.process import process
-    from rfpose.pipeline.result_file import summarise, write_poses_csv
+    from rfpose.pipeline.result_summary import summarise, write_poses_csv
 
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
     if csv_path is not None:

@@ -28,7 +28,8 @@ from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.mount_file import MountFile, StoredMount
-from rfpose.pipeline.result_file import frame_time, read_result
+from rfpose.pipeline.result import frame_time
+from rfpose.pipeline.result_file import read_result
 
 __all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 

@@ -12,7 +12,7 @@ from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.files import make_directory, refuse_existing
 from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import write_poses_csv
+from rfpose.pipeline.result_summary import write_poses_csv
 from rfpose.pipeline.simulate import simulate_recording
 from rfpose.pipeline.solve import solve
 from rfpose.recording import open_recording

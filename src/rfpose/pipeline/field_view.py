@@ -17,7 +17,7 @@ from rfpose.multilat import FixStatus, PoseStatus, RangeStatus
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.result_file import Result, frame_time
+from rfpose.pipeline.result import Result, frame_time
 from rfpose.scenario import Scenario
 
 __all__ = ["Exclusion", "FieldPicture", "History", "field_of_result", "field_of_scenario", "history", "project"]

@@ -9,7 +9,9 @@ from typing import Any
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.pipeline.choice import POSES
 from rfpose.pipeline.mount_file import is_model, read_models
-from rfpose.pipeline.result_file import frame_time, is_result, read_result, summarise
+from rfpose.pipeline.result import frame_time
+from rfpose.pipeline.result_file import is_result, read_result
+from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.solve import check_solvable
 from rfpose.recording import describe, open_recording
 from rfpose.scenario import Scenario, load_scenario

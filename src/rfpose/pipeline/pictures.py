@@ -14,7 +14,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.evaluate import Evaluation
 from rfpose.pipeline.files import write_atomically
-from rfpose.pipeline.result_file import Result
+from rfpose.pipeline.result import Result
 from rfpose.recording import Recording, frame_starts
 from rfpose.scenario import Scenario
 

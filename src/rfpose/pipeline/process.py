@@ -17,7 +17,8 @@ from rfpose.pipeline.choice import PoseChoice, choose
 from rfpose.pipeline.files import refuse_existing
 from rfpose.pipeline.measure import journal_key, measure_tones
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.result_file import Result, write_result
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_file import write_result
 from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.pipeline.truth_rows import align_truth
 from rfpose.recording import Recording, check_against, frame_starts, open_recording

@@ -1,18 +1,14 @@
-"""What processing found, and its file: format ``rfpose-result``, HDF5, described in ``docs/result-format.md``.
+"""The file of a result: format ``rfpose-result``, HDF5, described in ``docs/result-format.md``.
 
 Every name in the file stands in `KEYS`, with axes, unit and meaning; writer and reader both follow it.
 """
 
 from __future__ import annotations
 
-import csv
 import io
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from enum import IntEnum
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +16,22 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray, read_only
+from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, ScenarioError
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
-from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.result import (
+    DelayTable,
+    FilteredTable,
+    FixTable,
+    IntegrityTable,
+    PoseTable,
+    ReflectionTable,
+    Result,
+)
 from rfpose.scenario import Scenario, parse_scenario
 from rfpose.truth import Truth
 
@@ -36,258 +40,14 @@ __all__ = [
     "KEYS",
     "OPTIONAL",
     "VERSION",
-    "DelayTable",
-    "FilteredTable",
-    "FixTable",
-    "IntegrityTable",
     "Key",
-    "PoseTable",
-    "ReflectionTable",
-    "Result",
-    "StatusArray",
-    "count_reasons",
-    "frame_time",
     "is_result",
     "read_result",
-    "summarise",
-    "write_poses_csv",
     "write_result",
 ]
 
 FORMAT = "rfpose-result"
 VERSION = 1
-
-NEEDED_PROBABILITY = 1e-3
-"""Residuals of the direct ray alone that are rarer than this say that a reflection is needed."""
-
-EXPLAINED = (IntegrityStatus.EXCLUDED, IntegrityStatus.PRIOR_REJECTED, IntegrityStatus.AMBIGUOUS)
-"""Where what was left out explains the residuals; elsewhere its names mean nothing."""
-
-StatusArray = npt.NDArray[np.int8]
-
-
-# -- records -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FixTable:
-    """Positions of the receivers, each located on its own: `rfpose.multilat.Fixes` with a frame axis.
-
-    Attributes
-    ----------
-    position_enu_m : (frame, receiver, xyz)
-        Site ENU [m]. NaN = not solved.
-    cov_enu_m2 : (frame, receiver, xyz, xyz)
-        Covariance, calibration included [m²].
-    clock_m : (frame, receiver)
-        Range to the reference transmitter [m].
-    dop : (frame, receiver)
-        Position RMS over the standard deviation of one transmitter's range, all alike.
-    residual_m : (frame, receiver, transmitter)
-        Computed less measured range [m].
-    chi2 : (frame, receiver)
-        Sum of squared residuals over their variances.
-    n_transmitter, n_iteration : (frame, receiver)
-        Transmitters used, Gauss-Newton steps taken.
-    status : (frame, receiver)
-        `rfpose.multilat.FixStatus`.
-    """
-
-    position_enu_m: FloatArray
-    cov_enu_m2: FloatArray
-    clock_m: FloatArray
-    dop: FloatArray
-    residual_m: FloatArray
-    chi2: FloatArray
-    n_transmitter: npt.NDArray[np.int16]
-    n_iteration: npt.NDArray[np.int16]
-    status: StatusArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseTable:
-    """Mirror normals: `rfpose.multilat.Normals` with the mirrors' places.
-
-    Attributes
-    ----------
-    normal_enu : (frame, heliostat, xyz)
-        Unit length, out of the mirror's front. NaN = not solved.
-    cov_enu : (frame, heliostat, xyz, xyz)
-        Covariance of ``normal_enu`` (singular along the normal) [rad²].
-    sigma_rad : (frame, heliostat)
-        RMS angle of the normal's error, both axes together [rad].
-    azimuth_rad, elevation_rad : (frame, heliostat)
-        Of the normal; azimuth from north, clockwise [rad].
-    centre_enu_m : (frame, heliostat, xyz)
-        Mean position of the located receivers, site ENU [m].
-    n_receiver : (frame, heliostat)
-        Receivers used.
-    n_wavelength : (frame, heliostat)
-        Wavelengths that pose ``rigid`` rests on: tones, and the carrier, whose whole wavelengths were resolved.
-    integer_risk : (frame, heliostat)
-        Largest probability, beforehand, that one of them has a wrong whole wavelength. NaN for pose ``independent``.
-    integer_method : (frame, heliostat, clock)
-        `rfpose.multilat.rigid.integers.IntegerMethod` of each tone, the coarsest first, then of the carrier.
-    status : (frame, heliostat)
-        `rfpose.multilat.PoseStatus`.
-    """
-
-    normal_enu: FloatArray
-    cov_enu: FloatArray
-    sigma_rad: FloatArray
-    azimuth_rad: FloatArray
-    elevation_rad: FloatArray
-    centre_enu_m: FloatArray
-    n_receiver: npt.NDArray[np.int16]
-    n_wavelength: npt.NDArray[np.int16]
-    integer_risk: FloatArray
-    integer_method: npt.NDArray[np.int8]
-    status: StatusArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class IntegrityTable:
-    """What tests of the residuals found, of pose ``rigid``.
-
-    Attributes
-    ----------
-    status : (frame, heliostat)
-        `rfpose.multilat.integrity.IntegrityStatus`.
-    transmitter_status : (frame, heliostat, transmitter)
-        `rfpose.multilat.integrity.TransmitterStatus`: what was left out, and why.
-    used : (frame, receiver, transmitter)
-        Whether any of its phases is in the pose; false for calibration receivers.
-    prior_rejected, prior_testable : (frame, heliostat, prior)
-        Pivot, mount and clocks: which contradicts the data and was left out; which the data could contradict.
-    probability_all, probability : (frame, heliostat)
-        Of residuals as large or larger by noise alone, with everything, and with what was used.
-    protection_level_rad : (frame, heliostat)
-        The normal is off by more, without a warning, no more often than the scenario's ``missed_detection``, one
-        transmitter being wrong by whatever amount. Infinite where nothing protects it, NaN where there is no pose.
-    worst_transmitter : (frame, heliostat)
-        The one that sets it; −1: another explanation of an error found, or no pose.
-    """
-
-    status: StatusArray
-    transmitter_status: StatusArray
-    used: npt.NDArray[np.bool_]
-    prior_rejected: npt.NDArray[np.bool_]
-    prior_testable: npt.NDArray[np.bool_]
-    probability_all: FloatArray
-    probability: FloatArray
-    protection_level_rad: FloatArray
-    worst_transmitter: npt.NDArray[np.int16]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReflectionTable:
-    """Coefficients of what reflects, as each pose was solved with.
-
-    Attributes
-    ----------
-    coefficient : (frame, heliostat, reflector)
-        Complex, at RF; the ground first, then the scenario's planes. With Fresnel's formulas the factor on them.
-    coefficient_sigma : (frame, heliostat, reflector, 2)
-        Standard deviation of real and imaginary part; 0 where given, NaN where not determined.
-    probability_direct : (frame, heliostat)
-        Of the residuals that the direct ray alone leaves in the tones: small says that the reflection is needed.
-    """
-
-    coefficient: npt.NDArray[np.complex128]
-    coefficient_sigma: FloatArray
-    probability_direct: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DelayTable:
-    """Delays between a mirror's receivers, learned over frames.
-
-    Attributes
-    ----------
-    delay_s : (frame, receiver, clock)
-        Less that of the mirror's first receiver, after the frame [s]. Clocks: tones from the coarsest on, then the
-        carrier. NaN: not learned, or nothing seen yet.
-    sigma_s : (frame, receiver, clock)
-        Its standard deviation [s].
-    jumped : (frame, heliostat)
-        A delay had jumped: all of the mirror's were learned anew from this frame.
-    """
-
-    delay_s: FloatArray
-    sigma_s: FloatArray
-    jumped: npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FilteredTable:
-    """Poses filtered over frames, each of the frame's middle: `rfpose.multilat.TrackedPoses`.
-
-    Attributes
-    ----------
-    normal_enu : (frame, heliostat, xyz)
-        Unit length; NaN = nothing known yet, or no longer.
-    cov_enu : (frame, heliostat, xyz, xyz)
-        Covariance of ``normal_enu`` (singular along the normal) [rad²].
-    sigma_rad : (frame, heliostat)
-        RMS angle of the normal's error, both axes together [rad].
-    pivot_enu_m, rate_enu_radps : (frame, heliostat, xyz)
-        Pivot [m]; turning rate [rad/s].
-    status : (frame, heliostat)
-        `rfpose.multilat.TrackStatus`.
-    """
-
-    normal_enu: FloatArray
-    cov_enu: FloatArray
-    sigma_rad: FloatArray
-    pivot_enu_m: FloatArray
-    rate_enu_radps: FloatArray
-    status: StatusArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
-    """All that processing a recording found.
-
-    Attributes
-    ----------
-    scenario
-        The site as it was processed; its receiver axis is the receiver axis here.
-    settings
-        What the result depends on besides the recording, as text.
-    frame_start_index : (frame,)
-        First sample of each frame, counted from the Unix epoch at the recording's sample rate.
-    tones, calibration, ranges, fixes, poses
-        The stages in order.
-    integrity, reflection, delays, filtered
-        What else the chosen estimator of poses found; None where it does not look for it.
-    truth
-        What was really there, copied from a simulated recording; else None.
-    """
-
-    scenario: Scenario
-    settings: Mapping[str, str]
-    frame_start_index: npt.NDArray[np.int64]
-    tones: TonePhases
-    calibration: Calibration
-    ranges: RangeDifferences
-    fixes: FixTable
-    poses: PoseTable
-    integrity: IntegrityTable | None = None
-    reflection: ReflectionTable | None = None
-    delays: DelayTable | None = None
-    filtered: FilteredTable | None = None
-    truth: Truth | None = None
-
-    @property
-    def sample_rate(self) -> Fraction:
-        """Nominal sample rate [1/s]."""
-        return Fraction(self.settings["sample_rate"])
-
-
-def frame_time(start_index: int, sample_rate: Fraction) -> datetime:
-    """Return the UTC time of a sample counted from the Unix epoch, to the microsecond."""
-    microseconds = int(start_index * 1_000_000 / sample_rate)
-    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=microseconds)
 
 
 # -- the names in the file -----------------------------------------------------------------------------------
@@ -590,166 +350,3 @@ class _Reader:
             if isinstance(axis, str):
                 self._length.setdefault(axis, got)
         return read_only(np.asarray(dataset[()], dtype=key.dtype))
-
-
-# -- for people ----------------------------------------------------------------------------------------------
-
-
-def count_reasons(status: npt.NDArray[Any], codes: type[IntEnum]) -> dict[str, int]:
-    """Count what went wrong, most frequent first; what went well is left out."""
-    counted = Counter(int(code) for code in status.ravel() if code != 0)
-    return {codes(code).reason: n for code, n in counted.most_common()}  # type: ignore[attr-defined]
-
-
-def summarise(result: Result) -> dict[str, Any]:
-    """Return counts of what was solved and what was not, with reasons; keys are part of the command line."""
-    is_mirror = np.array([row.heliostat is not None for row in result.scenario.receivers], bool)
-    parts = {
-        "poses": (result.poses.status, PoseStatus),
-        "fixes": (result.fixes.status[:, is_mirror], FixStatus),
-        "tones": (result.tones.status, LineStatus),
-    }
-    summary: dict[str, Any] = {
-        "frames": len(result.frame_start_index),
-        "heliostats": len(result.scenario.heliostat_ids),
-        "receivers": len(result.scenario.receiver_ids),
-        "estimator": result.settings["estimator"],
-        "pose": result.settings["pose"],
-    }
-    for name, (status, codes) in parts.items():
-        solved = int(np.count_nonzero(status == 0))
-        summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
-    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says", "filter": "off"}
-    summary["choice"] = {name: result.settings.get(name, default) for name, default in choice.items()}
-    if result.settings["pose"] == "rigid":
-        summary["integers"] = _summary_of_integers(result)
-    if result.integrity is not None:
-        summary["integrity"] = _summary_of_integrity(result, result.integrity)
-    if result.reflection is not None:
-        summary["reflection"] = _summary_of_reflection(result, result.reflection)
-    if result.delays is not None:
-        summary["delays"] = _summary_of_delays(result.delays)
-    if result.filtered is not None:
-        summary["filtered"] = _summary_of_filtered(result.filtered)
-    return summary
-
-
-def _summary_of_integers(result: Result) -> dict[str, Any]:
-    """Count, by wavelength, how integers of solved mirror-frames were found."""
-    scenario = result.scenario
-    names = [f"{f / 1e6:.9g} MHz" for f in np.sort(scenario.tone_hz)]
-    if any(h.oscillator == "shared" and h.carrier_phase for h in scenario.heliostat):
-        names.append("carrier")
-    method = result.poses.integer_method[result.poses.status == PoseStatus.OK]
-    return {
-        name: {IntegerMethod(code).reason: n for code, n in Counter(method[:, k].tolist()).most_common()}
-        for k, name in enumerate(names)
-    }
-
-
-def _summary_of_filtered(table: FilteredTable) -> dict[str, Any]:
-    sigma = table.sigma_rad[np.isfinite(table.sigma_rad)]
-    counted = Counter(table.status.ravel().tolist())
-    return {
-        "reasons": {TrackStatus(code).reason: n for code, n in counted.most_common()},
-        "sigma_mrad": 1e3 * float(np.median(sigma)) if sigma.size else None,
-    }
-
-
-def _summary_of_integrity(result: Result, table: IntegrityTable) -> dict[str, Any]:
-    excluded = {}
-    explained = np.isin(table.status, EXPLAINED)
-    for i, name in enumerate(result.scenario.transmitter_ids):
-        status = np.where(explained, table.transmitter_status[..., i], 0)
-        reasons = count_reasons(np.where(status > TransmitterStatus.NOT_RECEIVED, status, 0), TransmitterStatus)
-        if reasons:
-            excluded[name] = reasons
-    level = table.protection_level_rad[np.isfinite(table.protection_level_rad)]
-    return {
-        "reasons": count_reasons(table.status, IntegrityStatus),
-        "excluded": excluded,
-        "priors_rejected": {
-            name: int(np.count_nonzero(table.prior_rejected[..., k]))
-            for k, name in enumerate(PRIORS)
-            if np.any(table.prior_rejected[..., k])
-        },
-        "protected": int(level.size),
-        "protection_level_mrad": 1e3 * float(np.median(level)) if level.size else None,
-    }
-
-
-def _summary_of_reflection(result: Result, table: ReflectionTable) -> dict[str, Any]:
-    names = ("ground", *(plane.name for plane in result.scenario.reflection.plane))
-    needed = table.probability_direct < NEEDED_PROBABILITY
-    return {
-        "needed": int(np.count_nonzero(needed)),
-        "coefficients": {
-            name: _summary_of_coefficient(table.coefficient[..., p], table.coefficient_sigma[..., p, :])
-            for p, name in enumerate(names)
-        },
-    }
-
-
-def _summary_of_coefficient(coefficient: npt.NDArray[np.complex128], sigma: FloatArray) -> dict[str, Any]:
-    known = np.isfinite(coefficient.real) & np.isfinite(sigma).all(axis=-1)
-    if not np.any(known):
-        return {"status": "not determined", "real": None, "imag": None, "sigma": None}
-    value, spread = coefficient[known], np.hypot(sigma[known][:, 0], sigma[known][:, 1])
-    return {
-        "status": "given" if np.all(spread == 0.0) else "estimated",
-        "real": float(np.median(value.real)),
-        "imag": float(np.median(value.imag)),
-        "sigma": float(np.median(spread)),
-    }
-
-
-def _summary_of_delays(table: DelayTable) -> dict[str, Any]:
-    last = table.sigma_s[-1]
-    # the first receiver's delay is zero by definition
-    learned = last[np.isfinite(last) & (last > 0.0)]
-    return {
-        "jumps": int(np.count_nonzero(table.jumped)),
-        "last_sigma_ps": 1e12 * float(np.median(learned)) if learned.size else None,
-    }
-
-
-CSV_COLUMNS = (
-    "frame",
-    "time_utc",
-    "heliostat",
-    "azimuth_deg",
-    "elevation_deg",
-    "normal_east",
-    "normal_north",
-    "normal_up",
-    "normal_sigma_mrad",
-    "status",
-)
-
-
-def write_poses_csv(result: Result, path: str | Path) -> None:
-    """Write the mirror normals for people: degrees, milliradians of the normal, one row a frame and heliostat.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be written.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
-    poses = result.poses
-    for i_frame, start in enumerate(result.frame_start_index):
-        time = frame_time(int(start), result.sample_rate).isoformat(timespec="microseconds")
-        for i, heliostat in enumerate(result.scenario.heliostat_ids):
-            row = (i_frame, i)
-            numbers = [
-                f"{np.degrees(poses.azimuth_rad[row]):.6f}",
-                f"{np.degrees(poses.elevation_rad[row]):.6f}",
-                *(f"{value:.9f}" for value in poses.normal_enu[row]),
-                f"{1e3 * poses.sigma_rad[row]:.6f}",
-            ]
-            blank = ["" if number == "nan" else number for number in numbers]
-            status = PoseStatus(int(poses.status[row])).reason
-            writer.writerow([i_frame, time.replace("+00:00", "Z"), heliostat, *blank, status])
-    write_atomically(path, text.getvalue().encode())

@@ -25,7 +25,7 @@ from rfpose.multilat import (
 from rfpose.multilat.fix import check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
 from rfpose.pipeline.mirrors import is_calibrated
-from rfpose.pipeline.result_file import FixTable, PoseTable, Result
+from rfpose.pipeline.result import FixTable, PoseTable, Result
 from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from rfpose import __version__
 from rfpose.errors import RfposeError
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.result_file import Result, summarise
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_summary import summarise
 from rfpose.recording import describe
 from rfpose.viewer.export import picture_tag
 from rfpose.viewer.views.field import COLOURS, FieldView

@@ -10,7 +10,7 @@ from rfpose.dsp import Calibration, TonePhases
 from rfpose.multilat import RangeDifferences
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.result_file import FixTable, PoseTable
+from rfpose.pipeline.result import FixTable, PoseTable
 from rfpose.pipeline.rigid.direct import solve_direct
 from rfpose.pipeline.rigid.found import Stages
 from rfpose.pipeline.rigid.tables import RigidOutcome, Tables

@@ -15,9 +15,7 @@ from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, Transmitter
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.result_file import (
-    FixTable,
-)
+from rfpose.pipeline.result import FixTable
 from rfpose.scenario import Scenario
 
 RESIDUAL_PROBABILITY = 1e-9

@@ -19,13 +19,7 @@ from rfpose.pipeline.mirrors import (
     MirrorGroup,
     mirror_groups,
 )
-from rfpose.pipeline.result_file import (
-    DelayTable,
-    FilteredTable,
-    IntegrityTable,
-    PoseTable,
-    ReflectionTable,
-)
+from rfpose.pipeline.result import DelayTable, FilteredTable, IntegrityTable, PoseTable, ReflectionTable
 from rfpose.pipeline.rigid.found import (
     BoolArray,
     Found,

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from rfpose.errors import RfposeError
 from rfpose.pipeline.field_view import FieldPicture, field_of_result, field_of_scenario
-from rfpose.pipeline.result_file import Result, is_result, read_result
+from rfpose.pipeline.result import Result
+from rfpose.pipeline.result_file import is_result, read_result
 from rfpose.pipeline.spectra import SharedRecording, viewing_frames
 from rfpose.pipeline.track_file import is_track, read_track
 from rfpose.pipeline.track_view import TrackPicture, picture_of_track

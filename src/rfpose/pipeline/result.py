@@ -1,0 +1,252 @@
+"""What processing a recording found: the stages' records, as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from fractions import Fraction
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.dsp import Calibration, TonePhases
+from rfpose.multilat import RangeDifferences
+from rfpose.scenario import Scenario
+from rfpose.truth import Truth
+
+__all__ = [
+    "DelayTable",
+    "FilteredTable",
+    "FixTable",
+    "IntegrityTable",
+    "PoseTable",
+    "ReflectionTable",
+    "Result",
+    "StatusArray",
+    "frame_time",
+]
+
+StatusArray = npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FixTable:
+    """Positions of the receivers, each located on its own: `rfpose.multilat.Fixes` with a frame axis.
+
+    Attributes
+    ----------
+    position_enu_m : (frame, receiver, xyz)
+        Site ENU [m]. NaN = not solved.
+    cov_enu_m2 : (frame, receiver, xyz, xyz)
+        Covariance, calibration included [m²].
+    clock_m : (frame, receiver)
+        Range to the reference transmitter [m].
+    dop : (frame, receiver)
+        Position RMS over the standard deviation of one transmitter's range, all alike.
+    residual_m : (frame, receiver, transmitter)
+        Computed less measured range [m].
+    chi2 : (frame, receiver)
+        Sum of squared residuals over their variances.
+    n_transmitter, n_iteration : (frame, receiver)
+        Transmitters used, Gauss-Newton steps taken.
+    status : (frame, receiver)
+        `rfpose.multilat.FixStatus`.
+    """
+
+    position_enu_m: FloatArray
+    cov_enu_m2: FloatArray
+    clock_m: FloatArray
+    dop: FloatArray
+    residual_m: FloatArray
+    chi2: FloatArray
+    n_transmitter: npt.NDArray[np.int16]
+    n_iteration: npt.NDArray[np.int16]
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseTable:
+    """Mirror normals: `rfpose.multilat.Normals` with the mirrors' places.
+
+    Attributes
+    ----------
+    normal_enu : (frame, heliostat, xyz)
+        Unit length, out of the mirror's front. NaN = not solved.
+    cov_enu : (frame, heliostat, xyz, xyz)
+        Covariance of ``normal_enu`` (singular along the normal) [rad²].
+    sigma_rad : (frame, heliostat)
+        RMS angle of the normal's error, both axes together [rad].
+    azimuth_rad, elevation_rad : (frame, heliostat)
+        Of the normal; azimuth from north, clockwise [rad].
+    centre_enu_m : (frame, heliostat, xyz)
+        Mean position of the located receivers, site ENU [m].
+    n_receiver : (frame, heliostat)
+        Receivers used.
+    n_wavelength : (frame, heliostat)
+        Wavelengths that pose ``rigid`` rests on: tones, and the carrier, whose whole wavelengths were resolved.
+    integer_risk : (frame, heliostat)
+        Largest probability, beforehand, that one of them has a wrong whole wavelength. NaN for pose ``independent``.
+    integer_method : (frame, heliostat, clock)
+        `rfpose.multilat.rigid.integers.IntegerMethod` of each tone, the coarsest first, then of the carrier.
+    status : (frame, heliostat)
+        `rfpose.multilat.PoseStatus`.
+    """
+
+    normal_enu: FloatArray
+    cov_enu: FloatArray
+    sigma_rad: FloatArray
+    azimuth_rad: FloatArray
+    elevation_rad: FloatArray
+    centre_enu_m: FloatArray
+    n_receiver: npt.NDArray[np.int16]
+    n_wavelength: npt.NDArray[np.int16]
+    integer_risk: FloatArray
+    integer_method: npt.NDArray[np.int8]
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntegrityTable:
+    """What tests of the residuals found, of pose ``rigid``.
+
+    Attributes
+    ----------
+    status : (frame, heliostat)
+        `rfpose.multilat.integrity.IntegrityStatus`.
+    transmitter_status : (frame, heliostat, transmitter)
+        `rfpose.multilat.integrity.TransmitterStatus`: what was left out, and why.
+    used : (frame, receiver, transmitter)
+        Whether any of its phases is in the pose; false for calibration receivers.
+    prior_rejected, prior_testable : (frame, heliostat, prior)
+        Pivot, mount and clocks: which contradicts the data and was left out; which the data could contradict.
+    probability_all, probability : (frame, heliostat)
+        Of residuals as large or larger by noise alone, with everything, and with what was used.
+    protection_level_rad : (frame, heliostat)
+        The normal is off by more, without a warning, no more often than the scenario's ``missed_detection``, one
+        transmitter being wrong by whatever amount. Infinite where nothing protects it, NaN where there is no pose.
+    worst_transmitter : (frame, heliostat)
+        The one that sets it; −1: another explanation of an error found, or no pose.
+    """
+
+    status: StatusArray
+    transmitter_status: StatusArray
+    used: npt.NDArray[np.bool_]
+    prior_rejected: npt.NDArray[np.bool_]
+    prior_testable: npt.NDArray[np.bool_]
+    probability_all: FloatArray
+    probability: FloatArray
+    protection_level_rad: FloatArray
+    worst_transmitter: npt.NDArray[np.int16]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReflectionTable:
+    """Coefficients of what reflects, as each pose was solved with.
+
+    Attributes
+    ----------
+    coefficient : (frame, heliostat, reflector)
+        Complex, at RF; the ground first, then the scenario's planes. With Fresnel's formulas the factor on them.
+    coefficient_sigma : (frame, heliostat, reflector, 2)
+        Standard deviation of real and imaginary part; 0 where given, NaN where not determined.
+    probability_direct : (frame, heliostat)
+        Of the residuals that the direct ray alone leaves in the tones: small says that the reflection is needed.
+    """
+
+    coefficient: npt.NDArray[np.complex128]
+    coefficient_sigma: FloatArray
+    probability_direct: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DelayTable:
+    """Delays between a mirror's receivers, learned over frames.
+
+    Attributes
+    ----------
+    delay_s : (frame, receiver, clock)
+        Less that of the mirror's first receiver, after the frame [s]. Clocks: tones from the coarsest on, then the
+        carrier. NaN: not learned, or nothing seen yet.
+    sigma_s : (frame, receiver, clock)
+        Its standard deviation [s].
+    jumped : (frame, heliostat)
+        A delay had jumped: all of the mirror's were learned anew from this frame.
+    """
+
+    delay_s: FloatArray
+    sigma_s: FloatArray
+    jumped: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilteredTable:
+    """Poses filtered over frames, each of the frame's middle: `rfpose.multilat.TrackedPoses`.
+
+    Attributes
+    ----------
+    normal_enu : (frame, heliostat, xyz)
+        Unit length; NaN = nothing known yet, or no longer.
+    cov_enu : (frame, heliostat, xyz, xyz)
+        Covariance of ``normal_enu`` (singular along the normal) [rad²].
+    sigma_rad : (frame, heliostat)
+        RMS angle of the normal's error, both axes together [rad].
+    pivot_enu_m, rate_enu_radps : (frame, heliostat, xyz)
+        Pivot [m]; turning rate [rad/s].
+    status : (frame, heliostat)
+        `rfpose.multilat.TrackStatus`.
+    """
+
+    normal_enu: FloatArray
+    cov_enu: FloatArray
+    sigma_rad: FloatArray
+    pivot_enu_m: FloatArray
+    rate_enu_radps: FloatArray
+    status: StatusArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """All that processing a recording found.
+
+    Attributes
+    ----------
+    scenario
+        The site as it was processed; its receiver axis is the receiver axis here.
+    settings
+        What the result depends on besides the recording, as text.
+    frame_start_index : (frame,)
+        First sample of each frame, counted from the Unix epoch at the recording's sample rate.
+    tones, calibration, ranges, fixes, poses
+        The stages in order.
+    integrity, reflection, delays, filtered
+        What else the chosen estimator of poses found; None where it does not look for it.
+    truth
+        What was really there, copied from a simulated recording; else None.
+    """
+
+    scenario: Scenario
+    settings: Mapping[str, str]
+    frame_start_index: npt.NDArray[np.int64]
+    tones: TonePhases
+    calibration: Calibration
+    ranges: RangeDifferences
+    fixes: FixTable
+    poses: PoseTable
+    integrity: IntegrityTable | None = None
+    reflection: ReflectionTable | None = None
+    delays: DelayTable | None = None
+    filtered: FilteredTable | None = None
+    truth: Truth | None = None
+
+    @property
+    def sample_rate(self) -> Fraction:
+        """Nominal sample rate [1/s]."""
+        return Fraction(self.settings["sample_rate"])
+
+
+def frame_time(start_index: int, sample_rate: Fraction) -> datetime:
+    """Return the UTC time of a sample counted from the Unix epoch, to the microsecond."""
+    microseconds = int(start_index * 1_000_000 / sample_rate)
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=microseconds)

@@ -1,0 +1,204 @@
+"""A result in words and rows for people: counts, reasons, poses as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.dsp import LineStatus
+from rfpose.multilat import FixStatus, PoseStatus, TrackStatus
+from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity.hypotheses import PRIORS
+from rfpose.multilat.rigid.integers import IntegerMethod
+from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.result import (
+    DelayTable,
+    FilteredTable,
+    IntegrityTable,
+    ReflectionTable,
+    Result,
+    frame_time,
+)
+
+__all__ = [
+    "CSV_COLUMNS",
+    "EXPLAINED",
+    "NEEDED_PROBABILITY",
+    "count_reasons",
+    "summarise",
+    "write_poses_csv",
+]
+
+NEEDED_PROBABILITY = 1e-3
+"""Residuals of the direct ray alone that are rarer than this say that a reflection is needed."""
+
+EXPLAINED = (IntegrityStatus.EXCLUDED, IntegrityStatus.PRIOR_REJECTED, IntegrityStatus.AMBIGUOUS)
+"""Where what was left out explains the residuals; elsewhere its names mean nothing."""
+
+
+def count_reasons(status: npt.NDArray[Any], codes: type[IntEnum]) -> dict[str, int]:
+    """Count what went wrong, most frequent first; what went well is left out."""
+    counted = Counter(int(code) for code in status.ravel() if code != 0)
+    return {codes(code).reason: n for code, n in counted.most_common()}  # type: ignore[attr-defined]
+
+
+def summarise(result: Result) -> dict[str, Any]:
+    """Return counts of what was solved and what was not, with reasons; keys are part of the command line."""
+    is_mirror = np.array([row.heliostat is not None for row in result.scenario.receivers], bool)
+    parts = {
+        "poses": (result.poses.status, PoseStatus),
+        "fixes": (result.fixes.status[:, is_mirror], FixStatus),
+        "tones": (result.tones.status, LineStatus),
+    }
+    summary: dict[str, Any] = {
+        "frames": len(result.frame_start_index),
+        "heliostats": len(result.scenario.heliostat_ids),
+        "receivers": len(result.scenario.receiver_ids),
+        "estimator": result.settings["estimator"],
+        "pose": result.settings["pose"],
+    }
+    for name, (status, codes) in parts.items():
+        solved = int(np.count_nonzero(status == 0))
+        summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
+    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says", "filter": "off"}
+    summary["choice"] = {name: result.settings.get(name, default) for name, default in choice.items()}
+    if result.settings["pose"] == "rigid":
+        summary["integers"] = _summary_of_integers(result)
+    if result.integrity is not None:
+        summary["integrity"] = _summary_of_integrity(result, result.integrity)
+    if result.reflection is not None:
+        summary["reflection"] = _summary_of_reflection(result, result.reflection)
+    if result.delays is not None:
+        summary["delays"] = _summary_of_delays(result.delays)
+    if result.filtered is not None:
+        summary["filtered"] = _summary_of_filtered(result.filtered)
+    return summary
+
+
+def _summary_of_integers(result: Result) -> dict[str, Any]:
+    """Count, by wavelength, how integers of solved mirror-frames were found."""
+    scenario = result.scenario
+    names = [f"{f / 1e6:.9g} MHz" for f in np.sort(scenario.tone_hz)]
+    if any(h.oscillator == "shared" and h.carrier_phase for h in scenario.heliostat):
+        names.append("carrier")
+    method = result.poses.integer_method[result.poses.status == PoseStatus.OK]
+    return {
+        name: {IntegerMethod(code).reason: n for code, n in Counter(method[:, k].tolist()).most_common()}
+        for k, name in enumerate(names)
+    }
+
+
+def _summary_of_filtered(table: FilteredTable) -> dict[str, Any]:
+    sigma = table.sigma_rad[np.isfinite(table.sigma_rad)]
+    counted = Counter(table.status.ravel().tolist())
+    return {
+        "reasons": {TrackStatus(code).reason: n for code, n in counted.most_common()},
+        "sigma_mrad": 1e3 * float(np.median(sigma)) if sigma.size else None,
+    }
+
+
+def _summary_of_integrity(result: Result, table: IntegrityTable) -> dict[str, Any]:
+    excluded = {}
+    explained = np.isin(table.status, EXPLAINED)
+    for i, name in enumerate(result.scenario.transmitter_ids):
+        status = np.where(explained, table.transmitter_status[..., i], 0)
+        reasons = count_reasons(np.where(status > TransmitterStatus.NOT_RECEIVED, status, 0), TransmitterStatus)
+        if reasons:
+            excluded[name] = reasons
+    level = table.protection_level_rad[np.isfinite(table.protection_level_rad)]
+    return {
+        "reasons": count_reasons(table.status, IntegrityStatus),
+        "excluded": excluded,
+        "priors_rejected": {
+            name: int(np.count_nonzero(table.prior_rejected[..., k]))
+            for k, name in enumerate(PRIORS)
+            if np.any(table.prior_rejected[..., k])
+        },
+        "protected": int(level.size),
+        "protection_level_mrad": 1e3 * float(np.median(level)) if level.size else None,
+    }
+
+
+def _summary_of_reflection(result: Result, table: ReflectionTable) -> dict[str, Any]:
+    names = ("ground", *(plane.name for plane in result.scenario.reflection.plane))
+    needed = table.probability_direct < NEEDED_PROBABILITY
+    return {
+        "needed": int(np.count_nonzero(needed)),
+        "coefficients": {
+            name: _summary_of_coefficient(table.coefficient[..., p], table.coefficient_sigma[..., p, :])
+            for p, name in enumerate(names)
+        },
+    }
+
+
+def _summary_of_coefficient(coefficient: npt.NDArray[np.complex128], sigma: FloatArray) -> dict[str, Any]:
+    known = np.isfinite(coefficient.real) & np.isfinite(sigma).all(axis=-1)
+    if not np.any(known):
+        return {"status": "not determined", "real": None, "imag": None, "sigma": None}
+    value, spread = coefficient[known], np.hypot(sigma[known][:, 0], sigma[known][:, 1])
+    return {
+        "status": "given" if np.all(spread == 0.0) else "estimated",
+        "real": float(np.median(value.real)),
+        "imag": float(np.median(value.imag)),
+        "sigma": float(np.median(spread)),
+    }
+
+
+def _summary_of_delays(table: DelayTable) -> dict[str, Any]:
+    last = table.sigma_s[-1]
+    # the first receiver's delay is zero by definition
+    learned = last[np.isfinite(last) & (last > 0.0)]
+    return {
+        "jumps": int(np.count_nonzero(table.jumped)),
+        "last_sigma_ps": 1e12 * float(np.median(learned)) if learned.size else None,
+    }
+
+
+CSV_COLUMNS = (
+    "frame",
+    "time_utc",
+    "heliostat",
+    "azimuth_deg",
+    "elevation_deg",
+    "normal_east",
+    "normal_north",
+    "normal_up",
+    "normal_sigma_mrad",
+    "status",
+)
+
+
+def write_poses_csv(result: Result, path: str | Path) -> None:
+    """Write the mirror normals for people: degrees, milliradians of the normal, one row a frame and heliostat.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    poses = result.poses
+    for i_frame, start in enumerate(result.frame_start_index):
+        time = frame_time(int(start), result.sample_rate).isoformat(timespec="microseconds")
+        for i, heliostat in enumerate(result.scenario.heliostat_ids):
+            row = (i_frame, i)
+            numbers = [
+                f"{np.degrees(poses.azimuth_rad[row]):.6f}",
+                f"{np.degrees(poses.elevation_rad[row]):.6f}",
+                *(f"{value:.9f}" for value in poses.normal_enu[row]),
+                f"{1e3 * poses.sigma_rad[row]:.6f}",
+            ]
+            blank = ["" if number == "nan" else number for number in numbers]
+            status = PoseStatus(int(poses.status[row])).reason
+            writer.writerow([i_frame, time.replace("+00:00", "Z"), heliostat, *blank, status])
+    write_atomically(path, text.getvalue().encode())
