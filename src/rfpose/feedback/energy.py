@@ -29,6 +29,7 @@ __all__ = [
     "clear_beam_w_m2",
     "combine_errors_rad",
     "dish_capture",
+    "dish_capture_at",
     "dish_efficiency",
     "draw_bursts",
     "energy",
@@ -122,6 +123,29 @@ def dish_capture(
     """
     ratio = as_float_array("area_ratio", area_ratio, ("...",), positive=True)
     return np.asarray(-np.expm1(-_area_scale(h_per_deg, sigma_rad, rim_rad) / ratio))
+
+
+def dish_capture_at(
+    error_rad: npt.ArrayLike, area_ratio: float, *, h_per_deg: float, rim_rad: float = np.pi / 3.0
+) -> FloatArray:
+    """Return what a cavity captures while the dish's axis is off by so much: (4.12) before its average over errors.
+
+    A Gaussian image (4.6) beside the middle of a round aperture. As in (4.10) the error moves it so that its peak
+    falls by exp(−(180/π)² h² β²); over errors that scatter by σ in each direction the mean is `dish_capture`.
+
+    Parameters
+    ----------
+    error_rad : (...)
+        β, angle between axis and sun [rad].
+    area_ratio, h_per_deg, rim_rad
+        As for `dish_capture`.
+    """
+    from scipy.stats import ncx2  # only where it is needed
+
+    ratio, h = as_positive("area_ratio", area_ratio), as_positive("h_per_deg", h_per_deg)
+    edge2 = 2.0 * float(_area_scale(h, 0.0, rim_rad)) / ratio
+    offset2 = 2.0 * (_DEG * h * as_float_array("error_rad", error_rad, ("...",))) ** 2
+    return np.asarray(ncx2.cdf(edge2, 2, offset2))
 
 
 def dish_efficiency(

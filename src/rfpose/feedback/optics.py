@@ -65,9 +65,13 @@ def target_offset_m(
 
 
 def intercept_ratio(
-    normal_error_rad: npt.ArrayLike, *, sun_rad: float = 9.3e-3, slope_error_rad: float = 1.5e-3
+    normal_error_rad: npt.ArrayLike,
+    *,
+    sun_rad: float = 9.3e-3,
+    slope_error_rad: float = 1.5e-3,
+    aperture_ratio: float = 1.0,
 ) -> FloatArray:
-    """Return the part of a heliostat's round image that an aperture of the image's size still catches [1]_.
+    """Return the part of a heliostat's round image that a round aperture catches [1]_.
 
     Parameters
     ----------
@@ -77,12 +81,22 @@ def intercept_ratio(
         Angle subtended by the sun [rad].
     slope_error_rad
         Mean slope error of the mirror [rad].
+    aperture_ratio
+        Radius of the aperture over that of the image; Malan's is one.
 
     References
     ----------
-    .. [1] Malan, A heliostat field control system, (3.3): overlap of two equal discs.
+    .. [1] Malan, A heliostat field control system, (3.3): overlap of two equal discs, here of any two.
     """
     error = np.abs(as_float_array("normal_error_rad", normal_error_rad, ("...",)))
+    big = as_positive("aperture_ratio", aperture_ratio)
     radius = 0.5 * as_positive("sun_rad", sun_rad) + slope_error_rad
-    half = np.minimum(error / (2.0 * radius), 1.0)
-    return np.asarray(2.0 / np.pi * (np.arccos(half) - half * np.sqrt(1.0 - half**2)))
+    d = error / radius  # between the middles, in radii of the image
+    inside = d <= abs(big - 1.0)
+    apart = d >= big + 1.0
+    safe = np.where(inside | apart, max(big, 1.0), d)
+    image = np.arccos(np.clip((safe**2 + 1.0 - big**2) / (2.0 * safe), -1.0, 1.0))
+    aperture = np.arccos(np.clip((safe**2 + big**2 - 1.0) / (2.0 * safe * big), -1.0, 1.0))
+    kite = (1.0 + big - safe) * (safe + 1.0 - big) * (safe - 1.0 + big) * (safe + 1.0 + big)
+    lens = (image + big**2 * aperture - 0.5 * np.sqrt(np.maximum(kite, 0.0))) / np.pi
+    return np.asarray(np.where(apart, 0.0, np.where(inside, min(1.0, big**2), lens)))

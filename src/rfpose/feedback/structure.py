@@ -25,6 +25,7 @@ __all__ = [
     "mass_ratio",
     "natural_frequency_hz",
     "plate_mode_hz",
+    "swing_transition",
 ]
 
 AIR_KG_M3 = 1.2
@@ -165,6 +166,26 @@ def deflect(static_rad: npt.ArrayLike, structure: Structure, *, interval_s: floa
     top, bottom = np.ravel(step[0]), np.ravel(step[1])
     start = signal.lfilter_zi(top, bottom) * static[..., :1]
     return np.asarray(signal.lfilter(top, bottom, static, axis=-1, zi=start)[0])
+
+
+def swing_transition(structure: Structure, *, interval_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return how a mode swings from one sample to the next: exact at the samples, whatever their interval.
+
+    State is deflection y and its speed, ``x' = transition @ x + root @ w`` with white w of variance one. The force
+    between samples is white about the mode, as Edwards takes it for (5.19), and scaled so that y has variance one.
+
+    Returns
+    -------
+    transition, root : (2, 2)
+        Units of seconds; ``root`` is a lower triangle.
+    """
+    from scipy.linalg import expm
+
+    w, damping = structure.natural_radps, structure.damping
+    transition = expm(np.array([[0.0, 1.0], [-(w**2), -2.0 * damping * w]]) * as_positive("interval_s", interval_s))
+    stationary = np.diag([1.0, w**2])
+    root = np.linalg.cholesky(stationary - transition @ stationary @ transition.T)
+    return np.asarray(transition), np.asarray(root)
 
 
 def mass_ratio(deflection_ratio: npt.ArrayLike, *, bore_ratio: float, bore_fixed: bool = False) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -60,6 +61,38 @@ class Wind(Record):
     """CSV of measured speeds instead; its path from where the command is run."""
     deflection_mrad_per_mps2: Two = (0.003, 0.006)
     """Of the normal, sideways and up, by a steady wind of 1 m/s; it grows with the square of the speed."""
+
+
+class Structure(Record):
+    """What lies between drive and mirror: one mode of vibration (Edwards 6.1), stirred by wind and motors."""
+
+    natural_hz: NonNegative = 2.2
+    """At least 0.5, since gusts bend it as if it were stiff (5.20); 0: it does not swing. Not a multiple of
+    the servo's rate, whose samples would see it stand."""
+    damping: Annotated[float, Field(gt=0, lt=1)] = 0.02
+
+    @model_validator(mode="after")
+    def _faster_than_gusts(self) -> Self:
+        if 0.0 < self.natural_hz < 0.5:
+            raise ValueError(
+                f"`natural_hz` must be 0 (stiff) or at least 0.5, got {self.natural_hz:g}: a softer structure follows "
+                "gusts less than this simulation would have it"
+            )
+        return self
+
+
+class Aperture(Record):
+    """What catches the light."""
+
+    image_ratio: Positive = 1.0
+    """Heliostats: radius of the receiver's aperture over that of a mirror's image; 1 is Malan's (3.3)."""
+    h_per_deg: Positive = 3.9
+    """Dishes: accuracy of the contour (Edwards, ch. 4)."""
+    rim_deg: Annotated[float, Field(gt=0, le=90)] = 60.0
+    area_ratio: Positive | None = None
+    """Dishes: area of the dish over that of the cavity's aperture; none: the cavity that suits a perfect follower."""
+    loss_w_per_m2: Positive = 2e5
+    """Dishes: what a square metre of the cavity's aperture loses; chooses the cavity."""
 
 
 class Outage(Record):
@@ -167,6 +200,91 @@ class RadioModel(Record):
     """Random walk that the rolling fit allows each parameter."""
 
 
+class Bus(Record):
+    """Messages between the centre, clusters and heliostats (Malan), and how badly they travel."""
+
+    cluster_size: Annotated[int, Field(ge=1, le=254)] = 32
+    baud: Positive = 9600.0
+    lost: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    bit_error_rate: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    late: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    late_s: Positive = 0.5
+    """Mean delay of late messages."""
+
+
+class FieldControl(Record):
+    """Centre, clusters and local controllers, from stow in the morning to stow in the evening."""
+
+    bus: Bus = Bus()
+    between_messages: Literal["carried-on", "held"] = "carried-on"
+    """Whether mirrors carry the sun that they heard on by the clock, or stand until they hear of it again (Malan)."""
+    watchdog_intervals: Positive = 3.0
+    wind_average_s: Positive = 600.0
+    """Wind for stow is averaged over so long."""
+    wind_stow_mps: Positive = 10.0
+    wind_release_mps: Positive = 8.0
+    wind_release_s: Positive = 600.0
+    emergency_hold_s: NonNegative = 30.0
+    defocus_offset_m: Positive = 15.0
+    stow_deg: tuple[float, float] = (0.0, 0.0)
+    """Azimuth and elevation of the park position; Malan's: north, level."""
+    calibration_target_enu_m: tuple[float, float, float] | None = None
+    """Without it `camera.target_enu_m`; without both no calibration and no search."""
+    calibration_target_m: Positive = 2.0
+    """Its side."""
+    calibration_dwell_s: Positive = 60.0
+    """How long a mirror stays on the target before the camera looks (Berenguel: 18 to 60 s)."""
+    search_cells: Annotated[int, Field(ge=1)] = 81
+    search_dwell_s: Positive = 5.0
+    homing_sigma_mrad: NonNegative = 20.0
+    """Error of each axis' zero after its counts were lost and it was homed."""
+
+
+EventKind = Literal[
+    "stow", "approach", "point", "track", "calibrate", "defocus", "refocus", "hold", "zero-counts",
+    "emergency", "release", "cluster-fails", "cluster-returns", "centre-fails", "centre-returns",
+    "power-fails", "power-returns", "counts-lost",
+]  # fmt: skip
+OF_THE_FIELD = ("emergency", "release", "centre-fails", "centre-returns")
+OF_A_CLUSTER = ("cluster-fails", "cluster-returns")
+_ENDS = {"release", "cluster-returns", "centre-returns", "power-returns"}
+
+
+class Event(Record):
+    """Something that happens to the field, or an order to it."""
+
+    hour: Hour
+    """Local mean solar time."""
+    what: EventKind
+    day: Annotated[int, Field(ge=1)] | None = None
+    """Number of the simulated day, from 1; none: every day."""
+    heliostats: tuple[str, ...] = ()
+    """By name; none: all."""
+    cluster: Annotated[int, Field(ge=0)] | None = None
+    """Number of a cluster, from 0; for what happens to clusters, or instead of `heliostats`."""
+
+    @model_validator(mode="after")
+    def _names_whom(self) -> Self:
+        if self.what in OF_A_CLUSTER and self.cluster is None:
+            raise ValueError(f"event `{self.what}` at {self.hour:g} h needs the number of a `cluster`")
+        if self.what in OF_THE_FIELD and (self.heliostats or self.cluster is not None):
+            raise ValueError(f"event `{self.what}` at {self.hour:g} h concerns the whole field; name nobody")
+        if self.heliostats and self.cluster is not None:
+            raise ValueError(f"event `{self.what}` at {self.hour:g} h names both `heliostats` and a `cluster`")
+        return self
+
+    def contradicts(self, other: Event) -> bool:
+        """Whether two events of the same time cannot both be meant."""
+        same_time = self.hour == other.hour and (self.day is None or other.day is None or self.day == other.day)
+        if not same_time or self.what == other.what or self.what in _ENDS or other.what in _ENDS:
+            return False
+        if self.what in OF_A_CLUSTER or other.what in OF_A_CLUSTER or self.what.startswith("centre"):
+            return False
+        whole = not self.heliostats and self.cluster is None, not other.heliostats and other.cluster is None
+        shared = set(self.heliostats) & set(other.heliostats) or (self.cluster == other.cluster is not None)
+        return any(whole) or bool(shared)
+
+
 class Tracking(Record):
     """What `rfpose track` simulates."""
 
@@ -196,6 +314,11 @@ class Tracking(Record):
     mount_errors: MountErrors = MountErrors()
     drive: Drive = Drive()
     wind: Wind = Wind()
+    structure: Structure = Structure()
+    aperture: Aperture = Aperture()
+    field_control: FieldControl | None = None
+    """None: mirrors track from the first second, without modes and messages."""
+    event: tuple[Event, ...] = ()
     radio: RadioFeedback = RadioFeedback()
     camera: Camera = Camera()
     drone: Drone = Drone()
@@ -220,3 +343,37 @@ class Tracking(Record):
         if not self.inner_radius_m < self.field_radius_m:
             raise ValueError("`inner_radius_m` must be less than `field_radius_m`")
         return self
+
+    @model_validator(mode="after")
+    def _events_make_sense(self) -> Self:
+        if self.event and self.field_control is None:
+            raise ValueError("[[tracking.event]] needs field control to act on; add a table [tracking.field_control]")
+        control = self.field_control
+        if control is not None and control.wind_release_mps > control.wind_stow_mps:
+            raise ValueError(
+                f"`wind_release_mps` {control.wind_release_mps:g} must not exceed `wind_stow_mps` "
+                f"{control.wind_stow_mps:g}"
+            )
+        for one, other in itertools.combinations(self.event, 2):
+            if one.contradicts(other):
+                raise ValueError(
+                    f"events `{one.what}` and `{other.what}` contradict each other: both at {one.hour:g} h for the "
+                    "same mirrors; give them different times or mirrors"
+                )
+        for event in self.event:
+            if event.day is not None and event.day > self.days:
+                raise ValueError(f"event `{event.what}` is on day {event.day}, and only {self.days} are simulated")
+            if self.collector == "dish" and event.what in ("calibrate", "defocus", "refocus"):
+                raise ValueError(f"event `{event.what}` is for heliostats; dishes stow or have an emergency")
+            if event.what == "calibrate" and self.calibration_target_enu_m is None:
+                raise ValueError(
+                    "event `calibrate` needs a target: set [tracking.field_control] `calibration_target_enu_m`"
+                )
+        return self
+
+    @property
+    def calibration_target_enu_m(self) -> tuple[float, float, float] | None:
+        """Where mirrors calibrate while the field tracks [m]; none: nowhere."""
+        if self.field_control is not None and self.field_control.calibration_target_enu_m is not None:
+            return self.field_control.calibration_target_enu_m
+        return self.camera.target_enu_m

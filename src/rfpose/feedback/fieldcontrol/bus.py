@@ -47,6 +47,10 @@ class MessageStatus(IntEnum):
     """Nobody spoke: the cluster's controller is dead, or the heliostat heard no question or has no power."""
 
 
+_USABLE = np.isin(np.arange(len(MessageStatus)), (MessageStatus.OK, MessageStatus.UNDETECTED))
+"""Whether a message of this status is taken for sound."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusSettings:
     """How messages travel, and how badly.
@@ -249,24 +253,24 @@ def poll(
     sun, sun_delay = _fate(settings, n, rng)
     question, question_delay = _fate(settings, n, rng)
     answer, answer_delay = _fate(settings, n, rng)
-    sun = np.where(master_alive & listening, sun, MessageStatus.SILENT).astype(np.int8)
-    question = np.where(master_alive & listening, question, MessageStatus.SILENT).astype(np.int8)
+    cut_off = ~(master_alive & listening)
+    sun[cut_off] = MessageStatus.SILENT
+    question[cut_off] = MessageStatus.SILENT
     sun_s = start_s + settings.packet_s + sun_delay
     question_s = start_s + 2.0 * settings.packet_s + settings.gap_s + slot * settings.slot_s + question_delay
-    heard = (question == MessageStatus.OK) | (question == MessageStatus.UNDETECTED)
+    heard = _USABLE[question]
     answer[~heard] = MessageStatus.SILENT
-    delay = question_delay + answer_delay
-    too_late = heard & (delay > settings.gap_s)
-    hit = np.zeros(n, np.bool_)
-    hit[1:] = too_late[:-1] & (slot[1:] > 0)
-    usable = (answer == MessageStatus.OK) | (answer == MessageStatus.UNDETECTED)
-    answer[usable & hit] = MessageStatus.CORRUPTED
-    answer[too_late & (answer != MessageStatus.LOST)] = MessageStatus.LATE
+    if settings.late > 0.0:
+        too_late = heard & (question_delay + answer_delay > settings.gap_s)
+        hit = np.zeros(n, np.bool_)
+        hit[1:] = too_late[:-1] & (slot[1:] > 0)
+        answer[_USABLE[answer] & hit] = MessageStatus.CORRUPTED
+        answer[too_late & (answer != MessageStatus.LOST)] = MessageStatus.LATE
     answer_s = question_s + settings.reply_s + settings.packet_s + answer_delay
     return Delivery(
-        sun_s=_where_usable(sun, sun_s),
-        question_s=_where_usable(question, question_s),
-        answer_s=np.where(answer == MessageStatus.OK, answer_s, np.inf),
+        sun_s=np.where(_USABLE[sun], sun_s, np.inf),
+        question_s=np.where(heard, question_s, np.inf),
+        answer_s=np.where(answer == int(MessageStatus.OK), answer_s, np.inf),
         sun=sun,
         question=question,
         answer=answer,
@@ -276,7 +280,7 @@ def poll(
 def _fate(settings: BusSettings, n: int, rng: np.random.Generator) -> tuple[npt.NDArray[np.int8], FloatArray]:
     """Status and delay [s] of so many messages."""
     draw = rng.random(n)
-    status = np.full(n, MessageStatus.OK, np.int8)
+    status = np.full(n, int(MessageStatus.OK), np.int8)
     delay = np.zeros(n)
     bad = draw < settings.failing
     if bad.any():
@@ -320,8 +324,3 @@ def corrupt(raw: npt.NDArray[np.uint8], bit_error_rate: float, rng: np.random.Ge
     wrong = (position > first[:, None]) & (rng.random((len(raw), n_bit)) < bit_error_rate)
     wrong |= position == first[:, None]
     return raw ^ np.packbits(wrong, axis=1)
-
-
-def _where_usable(status: npt.NDArray[np.int8], time_s: FloatArray) -> FloatArray:
-    usable = (status == MessageStatus.OK) | (status == MessageStatus.UNDETECTED)
-    return np.asarray(np.where(usable, time_s, np.inf))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,19 +12,21 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.fieldcontrol.bus import BusSettings
-from rfpose.feedback.fieldcontrol.local import NOTHING, Heliostats
+from rfpose.feedback.fieldcontrol.bus import BusSettings, MessageStatus
+from rfpose.feedback.fieldcontrol.local import EARTH_RAD_S, NOTHING, Heliostats
 from rfpose.feedback.fieldcontrol.modes import COMMANDS, Event, Mode, refusal
-from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, ModeArray, Orders, Reply
+from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, Messages, ModeArray, Orders, Reply
 from rfpose.feedback.fieldcontrol.wire import Wire
 
-__all__ = ["FieldControl", "FieldSettings", "Orders", "Reply"]
+__all__ = ["FieldControl", "FieldSettings", "Messages", "Orders", "Reply"]
 
 _SAFETY = {Event.EMERGENCY: 3, Event.STOW: 2, Event.DEFOCUS: 1}
 _ALLOWED_IN_ALARM = frozenset({Event.STOW, Event.EMERGENCY, Event.ZERO_COUNTS})
 _WIND, _WIND_UNKNOWN, _NIGHT = "strong wind", "wind unknown", "sun below the horizon"
 _CENTRE_SILENT = "centre silent"
 _BY_ITSELF = frozenset({_WIND, _WIND_UNKNOWN, _NIGHT, _CENTRE_SILENT})
+_SUN_MARGIN_RAD = 1e-4
+_COUNTED = tuple(f"{what}_{status.name.lower()}" for what in ("sun", "question", "answer") for status in MessageStatus)
 
 
 class FieldControl:
@@ -82,6 +85,7 @@ class FieldControl:
         self.bus = bus or BusSettings()
         self.n_heliostat = n
         self._has_calibration = calibration is not None
+        self._lowest_sine = float(np.sin(self.settings.sun_lowest_rad))
         self._heliostats = Heliostats(
             aim_enu_m=aim,
             right_enu=_level_right(aim - pivot),
@@ -232,6 +236,17 @@ class FieldControl:
         """What keeps the centre from other orders than stow."""
         return tuple(self._alarms)
 
+    @property
+    def messages(self) -> Messages:
+        """How many messages and orders there have been, and what became of them."""
+        counts = dict(zip(_COUNTED, self._wire.n_fate.ravel().tolist(), strict=True))
+        return Messages(
+            **counts,
+            orders_sent=self._wire.n_sent,
+            orders_refused=self._heliostats.n_refused,
+            watchdog_emergencies=self._heliostats.n_watchdog,
+        )
+
     # time goes on
 
     def step(
@@ -278,8 +293,8 @@ class FieldControl:
         axis = as_float_array("axis_rad", axis_rad, (n, 2), finite=False)
         aim_axis = as_float_array("aim_axis_rad", aim_axis_rad, (n, 2), finite=False)
         sun = as_float_array("sun_enu", sun_enu, (3,))
-        feedback = np.broadcast_to(np.asarray(feedback_valid, np.bool_), (n,))
-        seen = np.broadcast_to(np.asarray(found, np.bool_), (n,))
+        feedback = _flags(feedback_valid, n)
+        seen = _flags(found, n)
         self._time_s = float(time_s)
         self._heliostats.count_steps(axis)
         if self._centre_lost_s is None:
@@ -291,6 +306,55 @@ class FieldControl:
         self._heliostats.watchdog(self._time_s, self._wire.watchdog_s)
         self._heliostats.notice(self._time_s, aim_axis, feedback, seen)
         return self._orders(aim_axis)
+
+    def quiet_until(self, time_s: float) -> float:
+        """Return up to when nothing happens, so that one step may take the place of many.
+
+        Stepping once, from the present time straight to any time up to the one returned, leaves the same `state`
+        as stepping there through times between, random numbers included, but for ``wire.reported_axis_rad``: a
+        report holds the axes of the step that took it up, so it differs where axes move, which those that follow
+        their aim do. The orders of the last step stand meanwhile. This holds while, up to that time,
+
+        - wind and feedback stay as given in the last step; feedback may change in the step there itself. Wind may vary
+          below ``wind_stow_m_s`` while there is no wind alarm: only the time in the state when it was last above
+          ``wind_release_m_s`` differs then, which the next strong wind sets anew;
+        - the sun moves no faster than the sky turns;
+        - nobody calls `command`, `emergency`, `fail_cluster` or another method that changes something.
+
+        Parameters
+        ----------
+        time_s
+            Up to when the caller would go at once, not before the last step [s].
+
+        Returns
+        -------
+        float
+            ``time_s``, or the beginning of the next round of questions if that is before it [s]: the sun is
+            read then. The present time: step as finely as events shall be seen. It is cautious: some of those times
+            would have been quiet. Not quiet are fields
+
+            - before the first step, and after a step in which a mode changed;
+            - with heliostats on their way to stow or to an aim, searching, or in an emergency;
+            - with an urgent order on the wire, or a question or answer to a heliostat for which an order waits, or
+              a message with wrong bits that the checksum missed. An order that waits for the next round is quiet;
+            - where a watchdog, the centre's silence, unknown wind or the end of a wind alarm would be due;
+            - whose sun is so near to ``sun_lowest_rad`` that it may cross it.
+
+        Raises
+        ------
+        InvalidInputError
+            Time going back.
+        """
+        if not time_s >= self._time_s:
+            raise InvalidInputError(f"`time_s` must not go back, got {time_s} after {self._time_s}")
+        until_s = min(float(time_s), self._wire.next_round_s)
+        quiet = (
+            until_s > self._time_s
+            and self._heliostats.rest(self._time_s, until_s, watchdog_s=self._wire.watchdog_s)
+            and self._wire.rest(until_s)
+            and self._centre_rests(until_s)
+        )
+        return until_s if quiet else self._time_s
 
     def _orders(self, aim_axis: FloatArray) -> Orders:
         local = self._heliostats
@@ -339,7 +403,7 @@ class FieldControl:
                 raise InvalidInputError(f"`state` does not fit this field: {key} is missing or of another shape")
         for part, owner, name in self._names():
             value = np.array(state[f"{part}.{name}"])
-            setattr(owner, name, value if value.ndim else float(value))
+            setattr(owner, name, value if value.ndim else value.item())
         centre = json.loads(bytes(state["centre"]).decode())
         self._alarms = centre["alarms"]
         self._wire.rng.bit_generator.state = centre["rng"]
@@ -407,7 +471,7 @@ class FieldControl:
 
     def _watch_wind(self, wind_m_s: float) -> None:
         now, settings = self._time_s, self.settings
-        if np.isfinite(wind_m_s):
+        if math.isfinite(wind_m_s):
             self._wind_known_s = now
             self._alarms.pop(_WIND_UNKNOWN, None)
         elif now - self._wind_known_s >= settings.wind_gap_s:
@@ -420,10 +484,32 @@ class FieldControl:
             self._alarms.pop(_WIND, None)
 
     def _watch_sun(self, sun_enu: FloatArray) -> None:
-        if sun_enu[2] < np.sin(self.settings.sun_lowest_rad) * np.linalg.norm(sun_enu):
+        if sun_enu[2] < self._lowest_sine * math.sqrt(sun_enu @ sun_enu):
             self._raise_alarm(_NIGHT, Event.STOW)
         else:
             self._alarms.pop(_NIGHT, None)
+
+    def _centre_rests(self, until_s: float) -> bool:
+        """Whether until a time none of the centre's clocks runs out and the sun does not cross its limit."""
+        settings, alarms = self.settings, self._alarms
+        if self._centre_lost_s is not None:
+            return _CENTRE_SILENT in alarms or until_s - self._centre_lost_s < settings.centre_silence_s
+        if max(self._wind_known_s, self._wind_calm_s) < self._time_s:
+            return False  # repaired since the last step: it has seen neither wind nor sun yet
+        if _WIND_UNKNOWN not in alarms and until_s - self._wind_known_s >= settings.wind_gap_s:
+            return False
+        if _WIND in alarms and until_s - self._wind_calm_s >= settings.wind_release_s:
+            return False
+        # the sun as last sent out, which has moved since and will: twice that way, and a packet's last digit
+        above = self._wire.round_sun_enu[2] - self._lowest_sine
+        margin = _SUN_MARGIN_RAD + 2.0 * EARTH_RAD_S * (until_s - self._wire.round_s)
+        return bool(abs(above) > margin and (above < 0.0) == (_NIGHT in alarms))
+
+
+def _flags(value: npt.ArrayLike, n: int) -> BoolArray:
+    """Return one flag a heliostat."""
+    flags = np.asarray(value, np.bool_)
+    return flags if flags.shape == (n,) else np.broadcast_to(flags, (n,))
 
 
 def _level_right(way_m: FloatArray) -> FloatArray:

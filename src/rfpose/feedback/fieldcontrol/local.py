@@ -6,14 +6,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.feedback.fieldcontrol.modes import Event, Mode, follow
+from rfpose.feedback.fieldcontrol.modes import TABLE, Event, Mode, follow
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, ModeArray
 
-__all__ = ["NOTHING", "Heliostats", "spiral_cells"]
+__all__ = ["EARTH_RAD_S", "NOTHING", "Heliostats", "spiral_cells"]
 
 NOTHING = -1
 """Stands for no event."""
-_EARTH_RAD_S = 2.0 * np.pi / 86400.0
+EARTH_RAD_S = 2.0 * np.pi / 86400.0
+"""How fast the sun moves over the sky at most [rad/s]."""
 
 
 def _modes(*members: Mode) -> BoolArray:
@@ -26,6 +27,10 @@ def _modes(*members: Mode) -> BoolArray:
 _FOLLOWS_AIM = _modes(Mode.POINT, Mode.TRACK, Mode.CALIBRATE, Mode.SEARCH, Mode.DEFOCUS)
 _ON_RECEIVER = _modes(Mode.APPROACH, Mode.POINT, Mode.TRACK, Mode.DEFOCUS)
 _ON_CALIBRATION = _modes(Mode.CALIBRATE, Mode.SEARCH)
+_UNDER_WAY = _modes(Mode.STOWING, Mode.APPROACH, Mode.SEARCH, Mode.EMERGENCY)
+"""Modes that end by themselves."""
+_GUARDED: BoolArray = TABLE[:, Event.HEARTBEAT_LOST] >= 0
+"""Modes that silence ends."""
 
 
 def spiral_cells(n: int) -> npt.NDArray[np.int64]:
@@ -81,6 +86,8 @@ class Heliostats:
         "cell",
         "refused",
         "before",
+        "n_refused",
+        "n_watchdog",
     )
 
     def __init__(
@@ -115,6 +122,8 @@ class Heliostats:
         self.cell = np.zeros(n, np.int64)
         self.refused = np.full(n, NOTHING, np.int8)
         self.before = mode.copy()
+        self.n_refused = 0
+        self.n_watchdog = 0
 
     def count_steps(self, axis_rad: FloatArray) -> None:
         """Take over where the axes are by now; forget what was refused before."""
@@ -122,13 +131,14 @@ class Heliostats:
         np.copyto(self.hold_rad, axis_rad, where=np.isnan(self.hold_rad))
         self.refused[:] = NOTHING
 
-    def apply(self, index: npt.NDArray[np.int64], event: Event, now_s: float) -> None:
-        """Let one event happen to heliostats."""
+    def apply(self, index: npt.NDArray[np.int64], event: Event, now_s: float) -> int:
+        """Let one event happen to heliostats; return how many modes it changed."""
         if index.size == 0:
-            return
+            return 0
         before = self.mode[index]
         after, refused = follow(before, np.full(index.size, event, np.int8))
         self.refused[index[refused]] = event
+        self.n_refused += int(refused.sum())
         if event in (Event.POINT, Event.TRACK, Event.REFOCUS, Event.ARRIVED):
             self.open_loop[index[~refused]] = event == Event.POINT
         other = after != before
@@ -138,11 +148,16 @@ class Heliostats:
         self.hold_rad[changed] = self.axis_rad[changed]
         self.cell[changed] = 0
         self._aims = None
+        return int(changed.size)
+
+    def hear(self, index: npt.NDArray[np.int64], at_s: FloatArray) -> None:
+        """Note when messages reached heliostats; the last counts, in whatever order they are taken up."""
+        self.heard_s[index] = np.maximum(self.heard_s[index], at_s)
 
     def believe_sun(self, index: npt.NDArray[np.int64], sun_enu: FloatArray, said_s: float, *, fresh_s: float) -> None:
         """Take sun angles over, unless they are further from fresh ones than the sun moves."""
         age = said_s - self.sun_s[index]
-        farthest = self.settings.sun_jump_rad + _EARTH_RAD_S * age
+        farthest = self.settings.sun_jump_rad + EARTH_RAD_S * age
         step = np.sqrt(((sun_enu - self.sun_enu[index]) ** 2).sum(axis=1))
         ok = (step <= farthest) | ~(age <= fresh_s)
         if not ok.all():
@@ -154,14 +169,28 @@ class Heliostats:
         """Let heliostats that heard nothing for too long help themselves."""
         silent = now_s - self.heard_s > limit_s
         if silent.any():
-            self.apply(np.flatnonzero(silent), Event.HEARTBEAT_LOST, now_s)
+            index = np.flatnonzero(silent & _GUARDED[self.mode])
+            self.n_watchdog += self.apply(index, Event.HEARTBEAT_LOST, now_s)
+
+    def rest(self, now_s: float, until_s: float, *, watchdog_s: float) -> bool:
+        """Whether no mode changes until a time, if nothing is heard or seen that was not so before."""
+        # what changed in the last step may go on in the next: feedback that is there makes a fresh POINT a TRACK
+        if _UNDER_WAY[self.mode].any() or (self.since_s >= now_s).any():
+            return False
+        silent = until_s - self.heard_s > watchdog_s
+        return not (silent.any() and (silent & _GUARDED[self.mode]).any())
 
     def notice(self, now_s: float, aim_axis_rad: FloatArray, feedback: BoolArray, found: BoolArray) -> None:
         """Let heliostats notice what they can see themselves."""
         settings, mode = self.settings, self.mode
-        self.apply(np.flatnonzero((mode == Mode.TRACK) & ~feedback), Event.FEEDBACK_LOST, now_s)
-        back = (mode == Mode.POINT) & feedback & ~self.open_loop
-        self.apply(np.flatnonzero(back), Event.FEEDBACK_BACK, now_s)
+        lost = (mode == int(Mode.TRACK)) & ~feedback
+        if lost.any():
+            self.apply(np.flatnonzero(lost), Event.FEEDBACK_LOST, now_s)
+        back = (mode == int(Mode.POINT)) & feedback & ~self.open_loop
+        if back.any():
+            self.apply(np.flatnonzero(back), Event.FEEDBACK_BACK, now_s)
+        if not _UNDER_WAY[mode].any():
+            return
         index = np.flatnonzero(mode == Mode.SEARCH)
         if index.size:
             self._search(index, now_s, found)
@@ -199,7 +228,10 @@ class Heliostats:
         """
         settings, mode, stow = self.settings, self.mode, self._stow_rad
         target = np.where(_FOLLOWS_AIM[mode][:, None], np.nan, self.hold_rad)
-        target[mode == Mode.STOW] = stow
+        target[mode == int(Mode.STOW)] = stow
+        unreachable = np.zeros(len(mode), np.bool_)
+        if not _UNDER_WAY[mode].any():
+            return target, unreachable
         index = np.flatnonzero(mode == Mode.STOWING)
         target[index, 1] = stow[1]
         lowered = np.abs(self.axis_rad[index, 1] - stow[1]) <= settings.arrived_rad
@@ -208,7 +240,6 @@ class Heliostats:
         way = stow[1] - self.hold_rad[index, 1]
         target[index, 1] += np.clip(way, -settings.emergency_drop_rad, settings.emergency_drop_rad)
         index = np.flatnonzero(mode == Mode.APPROACH)
-        unreachable = np.zeros(len(mode), np.bool_)
         unreachable[index] = ~np.isfinite(aim_axis_rad[index]).all(axis=1)
         index = index[~unreachable[index]]
         target[index, 0] = aim_axis_rad[index, 0]

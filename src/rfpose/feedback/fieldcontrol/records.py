@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["BoolArray", "FieldSettings", "ModeArray", "Orders", "Reply"]
+__all__ = ["BoolArray", "FieldSettings", "Messages", "ModeArray", "Orders", "Reply"]
 
 BoolArray = npt.NDArray[np.bool_]
 ModeArray = npt.NDArray[np.int8]
@@ -157,3 +157,51 @@ class Orders:
     refused: ModeArray
     unreachable: BoolArray
     alarms: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Messages:
+    """How many messages the whole field's buses have carried since the start, and what became of them.
+
+    Attributes
+    ----------
+    sun_ok, sun_lost, sun_corrupted, sun_undetected, sun_late, sun_silent
+        Sun's angles by `MessageStatus`, one a heliostat and round, as drawn when the round began; one that is still on
+        its way at the next round, or when its heliostat loses power, stays counted. Only answers are called late.
+    question_ok, question_lost, question_corrupted, question_undetected, question_late, question_silent
+        Questions, likewise.
+    answer_ok, answer_lost, answer_corrupted, answer_undetected, answer_late, answer_silent
+        Answers, likewise.
+    orders_sent
+        Orders to single heliostats that were put on their way, by commands and by alarms; not their repetitions.
+    orders_refused
+        Those that a heliostat refused, forged ones included.
+    watchdog_emergencies
+        How often a heliostat went to `Mode.EMERGENCY` by itself, since it heard nothing.
+    """
+
+    sun_ok: int
+    sun_lost: int
+    sun_corrupted: int
+    sun_undetected: int
+    sun_late: int
+    sun_silent: int
+    question_ok: int
+    question_lost: int
+    question_corrupted: int
+    question_undetected: int
+    question_late: int
+    question_silent: int
+    answer_ok: int
+    answer_lost: int
+    answer_corrupted: int
+    answer_undetected: int
+    answer_late: int
+    answer_silent: int
+    orders_sent: int
+    orders_refused: int
+    watchdog_emergencies: int
+
+    def as_dict(self) -> dict[str, int]:
+        """Return all counts by name."""
+        return asdict(self)

@@ -64,6 +64,8 @@ class Wire:
         "round_s",
         "arrival_s",
         "fate",
+        "n_fate",
+        "n_sent",
     )
 
     def __init__(
@@ -94,12 +96,15 @@ class Wire:
         self.round_s = start_s
         self.arrival_s = np.full((3, n), np.inf)
         self.fate = np.zeros((2, n), np.int8)
+        self.n_fate = np.zeros((3, len(MessageStatus)), np.int64)
+        self.n_sent = 0
 
     def send(self, command: Event, to: BoolArray, now_s: float, *, urgent: bool, from_centre: bool = True) -> None:
         """Put an order on its way: the centre repeats it to each cluster until that has it."""
         fresh = to & (self.pending != command)
         if not fresh.any():
             return
+        self.n_sent += int(fresh.sum())
         bus = self.bus
         tries = self.rng.geometric(1.0 - bus.failing, len(self.alive)) - 1
         travel_s = bus.packet_s + bus.central_retry_s * tries if from_centre else np.zeros(len(self.alive))
@@ -134,6 +139,18 @@ class Wire:
             self.next_round_s += self.bus.interval_s
         self._deliver(now_s)
 
+    def rest(self, until_s: float) -> bool:
+        """Whether nothing is on the wire until a time that does more than be heard, before the next round."""
+        if (self.urgent_s <= until_s).any():
+            return False
+        # what forged messages say is drawn in the order in which they are taken up
+        forged = self.fate == int(MessageStatus.UNDETECTED)
+        if forged.any() and (forged & (self.arrival_s[:2] <= until_s)).any():
+            return False
+        # an order waits for its question, and is done with by the answer
+        waits = self.pending != NOTHING
+        return not (waits.any() and (waits & (self.arrival_s[1:] <= until_s)).any())
+
     def _begin_round(self, start_s: float, sun_enu: FloatArray) -> None:
         """Draw a round; what of the last one is still on its way is out of date and dropped."""
         brought = poll(
@@ -141,11 +158,12 @@ class Wire:
             start_s,
             slot=self.heliostats.slot,
             master_alive=self.alive[self.cluster],
-            listening=self.heliostats.mode != Mode.POWER_LOSS,
+            listening=self.heliostats.mode != int(Mode.POWER_LOSS),
             rng=self.rng,
         )
-        self.arrival_s = np.stack([brought.sun_s, brought.question_s, brought.answer_s])
-        self.fate = np.stack([brought.sun, brought.question])
+        self.arrival_s = np.array([brought.sun_s, brought.question_s, brought.answer_s])
+        self.fate = np.array([brought.sun, brought.question])
+        self.n_fate += [np.bincount(status, minlength=len(MessageStatus)) for status in (*self.fate, brought.answer)]
         said = packets.sun_from_payload(self._sun_payload(sun_enu))
         self.round_sun_enu = geometry.enu_from_azimuth_elevation(*said)
         self.round_s = start_s
@@ -157,23 +175,24 @@ class Wire:
 
     def _deliver(self, until_s: float) -> None:
         """Let everything arrive that does until a time."""
-        urgent = np.flatnonzero(self.urgent_s <= until_s)
-        if urgent.size:
-            self.heliostats.heard_s[urgent] = self.urgent_s[urgent]
+        if (self.urgent_s <= until_s).any():
+            urgent = np.flatnonzero(self.urgent_s <= until_s)
+            self.heliostats.hear(urgent, self.urgent_s[urgent])
             self.urgent_s[urgent] = np.inf
             self._obey(urgent, until_s)
-        for arrival_s, receive in zip(
-            self.arrival_s, (self._hear_sun, self._hear_question, self._hear_answer), strict=True
-        ):
-            index = np.flatnonzero(arrival_s <= until_s)
+        arrived = self.arrival_s <= until_s
+        if not arrived.any():
+            return
+        for i, receive in enumerate((self._hear_sun, self._hear_question, self._hear_answer)):
+            index = np.flatnonzero(arrived[i])
             if index.size:
-                at_s = arrival_s[index]
-                arrival_s[index] = np.inf
+                at_s = self.arrival_s[i, index]
+                self.arrival_s[i, index] = np.inf
                 receive(index, at_s, until_s)
 
     def _hear_sun(self, index: npt.NDArray[np.int64], at_s: FloatArray, now_s: float) -> None:
-        self.heliostats.heard_s[index] = at_s
-        good = self.fate[0, index] == MessageStatus.OK
+        self.heliostats.hear(index, at_s)
+        good = self.fate[0, index] == int(MessageStatus.OK)
         self.heliostats.believe_sun(index[good], self.round_sun_enu[None], self.round_s, fresh_s=self.watchdog_s)
         for i in index[~good]:
             self._hear_forged_sun(int(i))
@@ -191,8 +210,8 @@ class Wire:
         return np.asarray(packets.forge(raw, self.rng)[0])
 
     def _hear_question(self, index: npt.NDArray[np.int64], at_s: FloatArray, now_s: float) -> None:
-        self.heliostats.heard_s[index] = at_s
-        good = self.fate[1, index] == MessageStatus.OK
+        self.heliostats.hear(index, at_s)
+        good = self.fate[1, index] == int(MessageStatus.OK)
         ordered = (self.pending[index] != NOTHING) & (self.pending_s[index] <= at_s)
         self._obey(index[good & ordered], now_s)
         for i in index[~good]:
@@ -218,6 +237,8 @@ class Wire:
     def _obey(self, index: npt.NDArray[np.int64], now_s: float) -> None:
         """Do what is ordered, once: the time stamp tells a repeated order."""
         index = index[(self.pending[index] != NOTHING) & ~self.done[index]]
+        if index.size == 0:
+            return
         self.done[index] = True
         for event in np.unique(self.pending[index]):
             self.heliostats.apply(index[self.pending[index] == event], Event(event), now_s)

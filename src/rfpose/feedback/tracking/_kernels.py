@@ -18,13 +18,19 @@ from rfpose.jit import kernel, kernel_parallel
 
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
+# what a mirror is to do: turn its motors to a goal, follow its aim by the model, or with feedback too
+GO, FOLLOW, TRACK = 0, 1, 2
+
 # state of a mirror under one method
 MOTOR, AXIS, COMMAND, NEXT, SLIP, MOVED, INNOVATION, SHIFT, RAMP = 0, 2, 4, 6, 8, 10, 12, 14, 17
 GOAL, LEARNED, SILENT, STARTED, UNREACHABLE, CLOUDED, FRESH = 20, 22, 23, 24, 25, 26, 27
-N_STATE = 28
+SWING, RATE, SINCE = 28, 32, 34
+N_STATE = 35
 
-# a measurement on its way
+# a measurement on its way: what became of it, the error to steer by, the innovation to learn from
 N_RING, N_ENTRY = 16, 6
+LOST, USED, HEARD = 0.0, 1.0, 2.0
+"""Heard: received while the mirror was about something else; neither steered by nor learnt from."""
 
 # what is added up over a day
 (
@@ -33,6 +39,9 @@ N_RING, N_ENTRY = 16, 6
     SUNSHINE, BURSTS, BURST_ERROR, TURNING, FRESH_ENERGY, FRESH_CAUGHT,
 ) = range(24)  # fmt: skip
 N_SUM = 24
+
+# by mode of the field control, or all under one where there is none
+MODE_S, MODE_OFFERED, MODE_CAUGHT = range(3)
 
 RESPONSE_S = 30.0
 """How long after the sun comes out light is counted apart, for what the response costs."""
@@ -62,17 +71,57 @@ class Loop(NamedTuple):
     """Width of a level of encoder or sun sensor [rad]."""
     reach: float
     """Where the sun sensor saturates [rad]."""
-    disc: float
-    """Radius of the sun's image on a unit distance, half [rad] (Malan 3.3)."""
+    per_rad: float
+    """Entries of the table of captures to a radian."""
+    pole_n: float
+    pole_u: float
+    """The celestial pole, north and up."""
+    turn: float
+    """How far a mirror carries on a sun that it heard of, in a servo step [rad]; 0: it does not."""
+    swings: bool
+    y_y: float
+    y_v: float
+    v_y: float
+    v_v: float
+    """Transition of the structure's swing over a servo step."""
+    root_y: float
+    root_vy: float
+    root_v: float
+    """Its noise, lower triangle."""
+    swing_right: float
+    swing_up: float
+    """Its standard deviation [rad]."""
 
 
 @kernel
-def _caught(error, disc):
-    """Intercept ratio of two discs (Malan 3.3)."""
-    half = error / (2.0 * disc)
-    if half >= 1.0:
+def _caught(error, table, per_rad):
+    """What of its light a mirror with this error of its normal brings into the aperture."""
+    place = error * per_rad
+    if not place < len(table) - 1:
         return 0.0
-    return 2.0 / math.pi * (math.acos(half) - half * math.sqrt(1.0 - half * half))
+    i = int(place)
+    return table[i] + (place - i) * (table[i + 1] - table[i])
+
+
+@kernel
+def _carried(heard, angle, loop, out):
+    """Turn a direction about the celestial pole by an angle, as the sky turns."""
+    s, c = math.sin(angle), math.cos(angle)
+    along = (heard[1] * loop.pole_n + heard[2] * loop.pole_u) * (1.0 - c)
+    # sky turns clockwise about the north pole: heard × pole
+    out[0] = c * heard[0] + s * (heard[1] * loop.pole_u - heard[2] * loop.pole_n)
+    out[1] = c * heard[1] - s * heard[0] * loop.pole_u + along * loop.pole_n
+    out[2] = c * heard[2] + s * heard[0] * loop.pole_n + along * loop.pole_u
+
+
+@kernel
+def _off(row, posture, wanted):
+    """Angle between a normal and the one that the row wants from this mirror centre."""
+    _bisector(row, posture[3:], wanted)
+    total = 0.0
+    for i in range(3):
+        total += (wanted[i] - posture[i]) ** 2
+    return math.sqrt(total)
 
 
 @kernel
@@ -178,11 +227,40 @@ def _shifted(p, k, prepared, shift, counts, guess, row, work):
 
 
 @kernel
+def _swing(loop, noise, rate_right, rate_up, state):
+    """Let the structure swing through a step after its motors took on new speeds [rad a servo step]."""
+    for a in range(2):
+        rate = rate_right if a == 0 else rate_up
+        y = state[SWING + 2 * a]
+        # the mirror stays behind what holds it
+        v = state[SWING + 2 * a + 1] - (rate - state[RATE + a]) / loop.servo_s
+        scale = loop.swing_right if a == 0 else loop.swing_up
+        w0, w1 = noise[2 * a], noise[2 * a + 1]
+        state[SWING + 2 * a] = loop.y_y * y + loop.y_v * v + scale * loop.root_y * w0
+        state[SWING + 2 * a + 1] = loop.v_y * y + loop.v_v * v + scale * (loop.root_vy * w0 + loop.root_v * w1)
+        state[RATE + a] = rate
+
+
+@kernel
+def _bend(n, right, up):
+    """Turn a normal by small angles."""
+    h = max(math.hypot(n[0], n[1]), 1e-9)
+    x, y, z = n[0], n[1], n[2]
+    n[0] = x - right * y / h - up * x * z / h
+    n[1] = y + right * x / h - up * y * z / h
+    n[2] = z + up * h
+    inverse = 1.0 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+    for i in range(3):
+        n[i] *= inverse
+
+
+@kernel
 def _track(
-    loop, law, drive_1, drive_2,
-    step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, hours, hour_of, histogram,
-    stride, trace_error, trace, keeps,
+    loop, law, drive_1, drive_2, table,
+    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
+    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
+    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, hours, hour_of, histogram,
+    stride, trace_error, trace_light, trace, keeps, light,
 ):  # fmt: skip
     """One mirror through a stretch of steps; see `advance`."""
     prepared = np.empty(16)
@@ -196,35 +274,51 @@ def _track(
     across = np.empty(2)
     counts = np.empty(2)
     change = np.empty(3)
+    seen = np.empty(3)
     row = np.zeros(10)
     is_dish = target[3] > 0.5
-    row[4:7] = target[:3]
+    row[4:7] = aim
     row[7] = 0.0 if is_dish else 1.0
     row[8] = 1.0
     row[9] = target[3]
+    receiver = row.copy()
+    receiver[4:7] = target[:3]
     aside = np.zeros(10)  # a row whose light comes from and goes to one direction
     aside[8] = 1.0
     lean_north, lean_east = p[0], p[1]
     plate_up, plate_right = p[29], p[30]
     _prepare(model, k, known)
-    n_step = len(power)
-    for s in range(n_step):
+    for s in range(first, end):
         g = step0 + s
         tick = g % loop.interval == 0
-        if s % 16 == 0:
+        if s % 16 == 0 or s == first:
             p[0] = lean_north + lean[0] * heat[s]
             p[1] = lean_east + lean[1] * heat[s]
             _prepare(p, k, prepared)
         # where the model says the motors belong, now and one interval ahead
-        if tick:
-            first = state[STARTED] == 0.0
+        if duty == GO:
+            state[UNREACHABLE] = 0.0
+            for a in range(2):
+                state[COMMAND + a] = goal[a]
+            for i in range(3):
+                state[RAMP + i] = 0.0
+        elif tick or (renew and s == first):
+            fresh = state[STARTED] == 0.0
             reached = True
-            if first:
-                reached = _command(model, k, known, row, sun[s], counts, work)
-                _nearest_turn(state[NEXT], k, counts)
-                state[NEXT], state[NEXT + 1] = counts[0], counts[1]
+            ahead = loop.interval - g % loop.interval
+            if fresh or (renew and s == first):
+                seen[:] = sun[s]
+                if age >= 0.0:
+                    _carried(heard, loop.turn * (age + s - first), loop, seen)
+                reached = _command(model, k, known, row, seen, counts, work)
+                if reached:
+                    _nearest_turn(state[NEXT], k, counts)
+                    state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
-            reached = _command(model, k, known, row, sun[s + loop.interval], counts, work) and reached
+            seen[:] = sun[s + ahead]
+            if age >= 0.0:
+                _carried(heard, loop.turn * (age + s - first + ahead), loop, seen)
+            reached = _command(model, k, known, row, seen, counts, work) and reached
             shift = state[SHIFT : SHIFT + 3]
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
                 reached = _shifted(model, k, known, shift, counts, guess, aside, work)
@@ -238,7 +332,7 @@ def _track(
                     if not math.isfinite(state[NEXT + a]):
                         state[NEXT + a] = 0.0
                     state[COMMAND + a] = state[NEXT + a]
-            if first:
+            if fresh:
                 for a in range(2):
                     step = drive_1.step
                     at = math.floor(state[COMMAND + a] / step + 0.5) * step
@@ -249,8 +343,9 @@ def _track(
         if loop.feedback != NO_FEEDBACK and due >= 0 and due % loop.interval == 0:
             entry = ring[(due // loop.interval) % N_RING]
             seconds = loop.interval * loop.servo_s
-            if entry[0] > 0.5:
-                state[SILENT] = 0.0
+            used = entry[0] == USED and duty == TRACK
+            state[SILENT] = state[SILENT] + 1.0 if entry[0] == LOST else 0.0
+            if used:
                 busy = False
                 for a in range(2):
                     busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > drive_1.speed
@@ -274,10 +369,9 @@ def _track(
                     state[INNOVATION] += entry[4]
                     state[INNOVATION + 1] += entry[5]
                     state[LEARNED] += 1.0
-            else:
-                state[SILENT] += 1.0
+            elif duty != GO:
                 for i in range(3):
-                    if state[SILENT] <= 5.0:
+                    if duty == TRACK and state[SILENT] <= 5.0:
                         state[SHIFT + i] += seconds * state[RAMP + i]
                     else:
                         state[RAMP + i] = 0.0
@@ -307,12 +401,16 @@ def _track(
         # motors, gears
         part = (g % loop.interval) / loop.interval
         for a in range(2):
-            want = state[COMMAND + a] + (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[13 + a]
-            want = min(max(want, k[22 + 2 * a]), k[23 + 2 * a])
+            want = state[COMMAND + a]
+            if duty != GO:
+                want += (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[13 + a]
+                want = min(max(want, k[22 + 2 * a]), k[23 + 2 * a])
             before = state[MOTOR + a]
+            change[a] = state[AXIS + a]
             state[MOTOR + a], state[AXIS + a], state[GOAL + a] = stepper_step(
                 want, before, state[AXIS + a], state[GOAL + a], drive_1 if a == 0 else drive_2, 1.0
             )
+            change[a] = (state[AXIS + a] - change[a]) / k[13 + a]
             move = state[MOTOR + a] - before
             total[MOTOR_1 + a] += abs(move)
             if move != 0.0 and state[MOVED + a] == 0.0:
@@ -323,35 +421,45 @@ def _track(
         axis_2 = _axis(1, state[AXIS + 1], p, k, prepared)
         _posture(axis_1, axis_2, p, prepared, 0.0, true)
         push = mean_speed * mean_speed + 2.0 * mean_speed * gust[s]
-        h = max(math.hypot(true[0], true[1]), 1e-9)
         right, up = bend[0] * push, bend[1] * push
-        x, y, z = true[0], true[1], true[2]
-        true[0] = x - right * y / h - up * x * z / h
-        true[1] = y + right * x / h - up * y * z / h
-        true[2] = z + up * h
-        inverse = 1.0 / math.sqrt(true[0] ** 2 + true[1] ** 2 + true[2] ** 2)
+        if loop.swings:
+            _swing(loop, swing[s], -math.hypot(true[0], true[1]) * change[0], change[1], state)
+            right += state[SWING]
+            up += state[SWING + 2]
+        _bend(true, right, up)
         for i in range(3):
-            true[i] *= inverse
-            row[i] = sun[s, i]
+            row[i] = receiver[i] = sun[s, i]
             if is_dish:
-                row[4 + i] = sun[s, i]
-        _bisector(row, true[3:], wanted)
-        angle = 0.0
-        for i in range(3):
-            error[i] = wanted[i] - true[i]
-            angle += error[i] * error[i]
-        angle = math.sqrt(angle)
+                row[4 + i] = receiver[4 + i] = sun[s, i]
+        angle = _off(row, true, wanted)
+        facing = max(true[0] * sun[s, 0] + true[1] * sun[s, 1] + true[2] * sun[s, 2], 0.0)
+        if tick or s % stride == 0 or s == end - 1:
+            # what the receiver gets, whatever the mirror is told to aim at
+            off = angle if scored else _off(receiver, true, hoped)
+            offered = facing
+            if not scored:
+                offered = max(hoped[0] * sun[s, 0] + hoped[1] * sun[s, 1] + hoped[2] * sun[s, 2], 0.0)
+            light[0] = facing * _caught(off, table, loop.per_rad)
+            light[1] = offered
         dark = outage[s] > 0
-        emerged = state[CLOUDED] > 0.0 and power[s] > 0.0
-        state[CLOUDED] = 0.0 if power[s] > 0.0 else 1.0
+        open_ = power[s] >= 0.0  # negative: the field is not to work yet, or no longer
+        emerged = open_ and state[CLOUDED] > 0.0 and power[s] > 0.0
+        if open_:
+            state[CLOUDED] = 0.0 if power[s] > 0.0 else 1.0
         state[FRESH] = RESPONSE_S / loop.servo_s if emerged else max(state[FRESH] - 1.0, 0.0)
-        if g >= loop.settle:
+        settled = scored and state[SINCE] >= loop.settle and open_
+        state[SINCE] = state[SINCE] + 1.0 if scored else 0.0
+        if open_:
+            by_mode[mode, MODE_S] += loop.servo_s
+            if tick:
+                by_mode[mode, MODE_OFFERED] += power[s] * loop.interval * light[1]
+                by_mode[mode, MODE_CAUGHT] += power[s] * loop.interval * light[0]
+        if settled:
             if state[UNREACHABLE] > 0.0:
                 total[OUT_OF_REACH] += 1.0
                 if tick:
                     total[COLD] += power[s] * loop.interval
             else:
-                facing = true[0] * sun[s, 0] + true[1] * sun[s, 1] + true[2] * sun[s, 2]
                 beam = angle
                 if not is_dish:
                     beam = 0.0
@@ -382,9 +490,8 @@ def _track(
                     total[OUTAGE_STEPS] += 1.0
                     total[OUTAGE_SQUARE] += angle * angle
                 if tick:
-                    # an error of the normal moves a heliostat's image by twice itself, a dish's by once
-                    energy = power[s] * loop.interval * max(facing, 0.0)
-                    caught = energy * _caught(0.5 * angle if is_dish else angle, loop.disc)
+                    energy = power[s] * loop.interval * facing
+                    caught = power[s] * loop.interval * light[0]
                     total[ENERGY] += energy
                     total[CAUGHT] += caught
                     if state[FRESH] > 0.0:
@@ -395,7 +502,8 @@ def _track(
                         total[OUTAGE_CAUGHT] += caught
         if s % stride == 0:
             i_trace = s // stride
-            trace_error[i_trace] = angle if state[UNREACHABLE] == 0.0 else np.nan
+            trace_error[i_trace] = angle if scored and state[UNREACHABLE] == 0.0 else np.nan
+            trace_light[i_trace, 0], trace_light[i_trace, 1] = light[0], light[1]
             if keeps:
                 trace[i_trace, 0], trace[i_trace, 1], trace[i_trace, 2] = true[0], true[1], true[2]
                 trace[i_trace, 3], trace[i_trace, 4] = state[MOTOR], state[MOTOR + 1]
@@ -405,18 +513,18 @@ def _track(
         if not tick or loop.feedback == NO_FEEDBACK:
             continue
         entry = ring[(g // loop.interval) % N_RING]
-        entry[0] = 1.0
+        entry[0] = HEARD if duty == GO else USED
         _posture(
             _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known, 0.0,
             guess,
         )  # fmt: skip
         if loop.feedback == RADIO:
-            if g >= loop.settle:
+            if settled:
                 total[FRAMES] += 1.0
             frame = s // loop.interval
             if dark or lost[frame] > 0:
-                entry[0] = 0.0
-                if g >= loop.settle:
+                entry[0] = LOST
+                if settled:
                     total[FRAMES_LOST] += 1.0
                 continue
             # measured minus known tilt of the plate is the mirror as the loop sees it
@@ -442,38 +550,47 @@ def _track(
                 error[i] = sun[s, i] - true[i]
             _across(true, error, across)
             for a in range(2):
-                seen = across[a] + sensor[a] + drift * heat[s]
-                seen = min(max(seen, -loop.reach), loop.reach * (1.0 - 1e-9))
-                across[a] = (math.floor(seen / loop.level) + 0.5) * loop.level
+                read = across[a] + sensor[a] + drift * heat[s]
+                read = min(max(read, -loop.reach), loop.reach * (1.0 - 1e-9))
+                across[a] = (math.floor(read / loop.level) + 0.5) * loop.level
             _along(true, across[0], across[1], entry[1:4])
             if not power[s] > 0.0:
-                entry[0] = 0.0
+                entry[0] = LOST
     p[0], p[1] = lean_north, lean_east
 
 
 @kernel_parallel
 def advance(
-    loop, law, drive_1, drive_2,
-    step0, p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, hours, hour_of, histogram,
-    stride, trace_error, stored, trace,
+    loop, law, drive_1, drive_2, table,
+    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
+    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
+    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, hours, hour_of, histogram,
+    stride, trace_error, trace_light, stored, trace, light,
 ):  # fmt: skip
-    """Take all mirrors through a stretch of steps, in place of ``model, cov, state, ring`` and the sums.
+    """Take all mirrors through steps ``first`` to ``end`` of a stretch, in place of ``model, cov, state, ring``, sums.
 
     ``law`` turns errors into speeds; ``drive_1, drive_2`` are in counts, a servo step being one unit of time. First
-    axis is the mirror. ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model``
-    what the controller believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz);
-    ``target`` (xyz, 1 for a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``noise`` (frame, 2) of variance
+    axis is the mirror; step ``s`` of the stretch is step ``step0 + s`` of the day. ``table`` of captures.
+
+    What mirrors are told: ``duty``; ``renew``: at the first step it or the aim is another than before; ``scored``: on
+    the receiver; ``mode`` row of ``by_mode``; ``aim`` (xyz); ``goal`` (2) counts; ``heard`` (xyz) sun, so many steps
+    ``age`` before the first step; negative: the sun is known.
+
+    ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model`` what the controller
+    believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz); ``target`` (xyz, 1 for
+    a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``swing`` (step, 4) and ``noise`` (frame, 2) of variance
     one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step);
-    ``power`` (step) [W/m²]; ``drift`` of plate or sensor [rad]; ``trace_error`` (trace); ``stored`` row of ``trace``
-    or −1; ``trace`` (stored, trace, 8).
+    ``power`` (step) [W/m²], negative outside the field's hours; ``drift`` of plate or sensor [rad]; ``trace_error``,
+    ``trace_light`` (trace, 2); ``stored`` row of ``trace`` or −1; ``trace`` (stored, trace, 8); ``light`` (2) caught
+    and offered, as parts of the beam, at the last step.
     """
     for h in nb.prange(p.shape[0]):
         keeps = stored[h] >= 0
         _track(
-            loop, law, drive_1, drive_2,
-            step0, p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
-            mean_speed, bend, noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-            sensor[h], state[h], ring[h], total[h], hours[h], hour_of, histogram[h], stride, trace_error[h],
-            trace[max(stored[h], 0)], keeps,
+            loop, law, drive_1, drive_2, table,
+            step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
+            p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
+            mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
+            sensor[h], state[h], ring[h], total[h], by_mode[h], hours[h], hour_of, histogram[h], stride,
+            trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h],
         )  # fmt: skip

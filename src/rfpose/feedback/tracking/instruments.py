@@ -27,7 +27,7 @@ from rfpose.feedback.tracking.timeline import Day, day_of, hour_of_day, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
 
-__all__ = ["LEARNED", "Workshop"]
+__all__ = ["LEARNED", "Workshop", "correct_zeros"]
 
 LEARNED = (
     "pedestal_tilt_north_rad", "pedestal_tilt_east_rad", "axis_1_zero_rad", "axis_2_zero_rad",
@@ -173,7 +173,7 @@ class Workshop:
             out = _kernels.posture_batch(p, field.constant, (count + slack * per_rad)[:, j : j + 1].copy(), 0.0)
             normal[:, j], centre[:, j] = out[:, 0, 2:5], out[:, 0, 5:]
         look = _Look(count=count, normal_enu=normal, centre_enu_m=centre, sun_enu=sun, heat=heat)
-        bent = look.tilted(self._gusts.bend_rad(self._gusts.draw(rng, (n, m))))
+        bent = look.tilted(self._gusts.bend_rad(self._gusts.draw(rng, (n, m))) + self._gusts.swing_rad(rng, (n, m)))
         return _Look(count=count, normal_enu=bent, centre_enu_m=centre, sun_enu=sun, heat=heat)
 
     def _camera_target(self) -> FloatArray:
@@ -313,21 +313,39 @@ class Workshop:
             look = self._look(p, when, since_first, rng, target).at_turns(turn_of)
             error, _ = self._camera_errors(look, target, rng)
             wanted = geometry.bisector_enu(target - look.centre_enu_m[:, 0], when_sun[turn_of])
-            right, up = look.axes()
-            off = wanted - look.normal_enu[:, 0]
-            right_off = np.sum(off * right[:, 0], axis=1) - error[:, 0, 0]
-            up_off = np.sum(off * up[:, 0], axis=1) - error[:, 0, 1]
-            cosine = np.maximum(np.hypot(wanted[:, 0], wanted[:, 1]), 0.05)
-            # near the zenith azimuth says little about where a mirror looks, and would be turned far for it
-            turn = np.stack([np.where(cosine > _STEEP, -right_off / cosine, 0.0), up_off], axis=1)
             distance = np.linalg.norm(target - look.centre_enu_m[:, 0], axis=1)
-            far = 2.0 * distance * np.hypot(right_off, up_off) > tolerance_m
-            turn = np.rint(turn * per_rad) / per_rad
-            turn[~(far & np.isfinite(turn).all(axis=1))] = 0.0
-            # the model is told that the axes stand short by what they have to turn further
-            p[:, _INDEX["axis_1_zero_rad"]] -= turn[:, 0]
-            p[:, _INDEX["axis_2_zero_rad"]] -= turn[:, 1]
+            seen = look.tilted(error)[:, 0]
+            far = 2.0 * distance * np.linalg.norm(wanted - seen, axis=1) > tolerance_m
+            correct_zeros(p, np.where(far[:, None], wanted, seen), seen, per_rad=per_rad)
         return p
+
+
+def correct_zeros(
+    model: FloatArray, wanted_enu: FloatArray, seen_enu: FloatArray, *, per_rad: FloatArray | float = np.inf
+) -> None:
+    """Take off both axes' zeros what mirrors were seen to be off, in place.
+
+    Parameters
+    ----------
+    model : (mirror, 34)
+        What is believed of the mounts.
+    wanted_enu, seen_enu : (mirror, xyz)
+        Normals; one that was not seen, NaN, changes nothing.
+    per_rad : (mirror, axis)
+        Turns are rounded to whole parts of this [1/rad]; infinite: not at all.
+    """
+    rot = geometry.rot_enu_from_mirror(wanted_enu)
+    off = wanted_enu - seen_enu
+    right_off, up_off = (np.sum(off * rot[:, :, i], axis=1) for i in (0, 1))
+    cosine = np.maximum(np.hypot(wanted_enu[:, 0], wanted_enu[:, 1]), 0.05)
+    # near the zenith azimuth says little about where a mirror looks, and would be turned far for it
+    turn = np.stack([np.where(cosine > _STEEP, -right_off / cosine, 0.0), up_off], axis=1)
+    if np.all(np.isfinite(per_rad)):
+        turn = np.rint(turn * per_rad) / per_rad
+    turn[~np.isfinite(turn).all(axis=1)] = 0.0
+    # the model is told that the axes stand short by what they have to turn further
+    model[:, _INDEX["axis_1_zero_rad"]] -= turn[:, 0]
+    model[:, _INDEX["axis_2_zero_rad"]] -= turn[:, 1]
 
 
 def _finite(normal: FloatArray) -> npt.NDArray[np.bool_]:

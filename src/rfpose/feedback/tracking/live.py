@@ -10,15 +10,14 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
-from rfpose.feedback import _kernels as mount_kernels
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
-from rfpose.feedback.fieldcontrol.motion import move_axes
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.instruments import Workshop
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS
+from rfpose.feedback.tracking.operation import Told
 from rfpose.feedback.tracking.radio import RadioErrors, RadioModel
 from rfpose.feedback.tracking.simulation import Simulation
 from rfpose.scenario import Scenario
@@ -32,8 +31,6 @@ _PLACE_DEG = (37.1, -2.4)
 _LEAST_WIND_MPS = 1e-3
 _RADIO_EVERY_S = 60.0
 _CALM_MPS = 0.0
-_STANDING = 1e-12
-"""Speed of a stopped motor [counts a step]: too small to move it, and not zero, which the kernel divides by."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +111,7 @@ def live_scenario(scenario: Scenario) -> Scenario:
     return scenario.model_copy(
         update={
             "site": site.model_copy(update=changes),
-            "tracking": scenario.tracking.model_copy(update={"days": 1}),
+            "tracking": scenario.tracking.model_copy(update={"days": 1, "field_control": None, "event": ()}),
         }
     )
 
@@ -123,8 +120,7 @@ class LiveField:
     """A field in closed radio loop on the scenario's first day; go on with `step`, disturb it at any time.
 
     Mounts, drives, wind, radio and loop are those of `Simulation`, whose step this takes one control interval at a
-    time. In an emergency `FieldControl` moves the axes instead, at the drives' speed; wind does not bend the mirrors
-    then.
+    time. In an emergency `FieldControl` tells where the axes go, at the drives' speed.
 
     Parameters
     ----------
@@ -160,6 +156,7 @@ class LiveField:
         self._gust_state = self._plan.gusts.process.start(generator(seed, 11, 0), len(self.field))
         self._gusts: list[tuple[float, float, float]] = []
         self._stopped = np.zeros(len(self.field), np.bool_)
+        self._renew = np.zeros(len(self.field), np.bool_)
         self._control: FieldControl | None = None
         self._radio_due = self._at
         self._radio_errors = self._measure()
@@ -234,8 +231,8 @@ class LiveField:
         self._stopped[:] = False
         if self._control is not None:
             self._control = None
+            self._renew[:] = True
             self._run.ring[:] = 0.0
-            self._run.state[:, _kernels.RAMP : _kernels.RAMP + 3] = 0.0
 
     # -- going on ------------------------------------------------------------------------------------------
 
@@ -253,11 +250,7 @@ class LiveField:
             self._radio_errors = self._measure()
         steps = slice(self._at, self._at + self._interval)
         extra = self._gust_mps(self._day.unix_s[steps])
-        if self._control is None:
-            normal, error = self._track(steps, extra)
-            mode = np.full(len(self.field), Mode.TRACK, np.int8)
-        else:
-            normal, error, mode = self._obey(self._control, steps)
+        normal, error, mode = self._go(steps, extra)
         self._at += self._interval
         sigma = np.where(self._radio_errors.solved, self._radio_errors.sigma_rad, np.nan)
         return Moment(
@@ -294,8 +287,8 @@ class LiveField:
             total += np.where(part <= 1.0, 0.5 * speed * (1.0 - np.cos(2.0 * np.pi * part)), 0.0)
         return total
 
-    def _track(self, steps: slice, extra_mps: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Take all mirrors through a step in closed loop; those with stopped motors without moving."""
+    def _go(self, steps: slice, extra_mps: FloatArray) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int8]]:
+        """Take all mirrors through a step; true normals, errors and modes at its end."""
         n, plan = len(self.field), self._scenario.tracking
         mean = max(self._plan.gusts.mean_mps, _LEAST_WIND_MPS)
         wind = self._plan.gusts.run(
@@ -307,56 +300,53 @@ class LiveField:
         noise = rng.standard_normal((n, 1, 2), dtype=np.float32)
         lost = (rng.random((n, 1), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
         lost[~self._radio_errors.solved] = 1
-        normal, error = np.empty((n, 3)), np.empty(n)
-        for rows, runs in ((np.flatnonzero(~self._stopped), True), (np.flatnonzero(self._stopped), False)):
-            if rows.size:
-                normal[rows], error[rows] = self._advance(rows, runs, steps, mean, gust, noise, lost)
-        return normal, error
+        told = Told.always_track(self.field)
+        told.renew[:] = self._renew
+        self._renew[:] = False
+        modes = np.full(n, Mode.TRACK, np.int8)
+        error, trace = np.full((n, self._interval), np.nan), np.full((n, self._interval, 8), np.nan)
+        # in an emergency field control has its say each second
+        each = self._interval if self._control is None else 1
+        for first in range(0, self._interval, each):
+            if self._control is not None:
+                modes = self._obey(self._control, steps.start + first, told)
+            told.duty[self._stopped] = _kernels.GO
+            told.goal[self._stopped] = self._run.state[self._stopped, _kernels.MOTOR : _kernels.MOTOR + 2]
+            self._advance(told, steps, (first, first + each), mean, gust, noise, lost, error, trace)
+        return trace[:, -1, :3], error[:, -1], modes
 
     def _advance(
-        self, rows: npt.NDArray[np.int64], runs: bool, steps: slice, mean_mps: float,
+        self, told: Told, steps: slice, span: tuple[int, int], mean_mps: float,
         gust: npt.NDArray[np.float32], noise: npt.NDArray[np.float32], lost: npt.NDArray[np.uint8],
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """Call the kernel for some mirrors and put their state back; true normals and errors at the end."""
-        run, field, day, n_step = self._run, self.field, self._day, self._interval
-        drives = [self._plan._drive(axis) for axis in (0, 1)]
-        if not runs:
-            drives = [drive._replace(speed=_STANDING) for drive in drives]
-        state, ring, model = run.state[rows], run.ring[rows], run.model[rows]
-        total, hours, histogram = run.total[0, rows], run.hours[rows], run.histogram[rows]
-        error, trace = np.full((len(rows), n_step), np.nan), np.full((len(rows), n_step, 8), np.nan)
+        error: FloatArray, trace: FloatArray,
+    ) -> None:  # fmt: skip
+        """Call the kernel for a part of the interval; errors and courses go into ``error`` and ``trace``."""
+        run, field, day, n_step, n = self._run, self.field, self._day, self._interval, len(self.field)
+        n_free = run.cov.shape[1]
+        rng = generator(self._seed, 16, steps.start)
         _kernels.advance(
-            run.loop, run.law, drives[0], drives[1],
-            steps.start, field.at(0.0)[rows], field.constant[rows], field.lean_rad[rows], day.heat[steps].copy(),
-            model, np.broadcast_to(run.cov, (len(rows), *run.cov.shape[1:])).copy(),
-            np.zeros(run.cov.shape[1], np.int64), np.zeros(run.cov.shape[1]), np.zeros(run.cov.shape[1]),
-            day.sun_enu[steps.start : steps.stop + n_step + 1].copy(), field.target[rows], gust[rows], mean_mps,
-            self._plan.gusts.bend, noise[rows], self._radio_errors.spread_rad[rows],
-            self._radio_errors.bias_rad[rows], lost[rows], np.zeros((len(rows), n_step), np.uint8),
-            day.power_w_per_m2[steps].copy(), field.plate_drift_rad[rows], field.sensor_bias_rad[rows],
-            state, ring, total, hours, day.hour[steps].astype(np.int64), histogram, 1, error,
-            np.arange(len(rows)), trace,
+            run.loop, run.law, self._plan._drive(0), self._plan._drive(1), self._plan._table,
+            steps.start, *span, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
+            told.age, field.at(0.0), field.constant, field.lean_rad, day.heat[steps].copy(), run.model,
+            np.zeros((n, n_free, n_free)), np.zeros(n_free, np.int64), np.zeros(n_free), np.zeros(n_free),
+            day.sun_enu[steps.start : steps.stop + n_step + 1].copy(), field.target, gust, mean_mps,
+            self._plan.gusts.bend, self._plan.gusts.draw_swing(rng, (n, n_step)), noise,
+            self._radio_errors.spread_rad, self._radio_errors.bias_rad, lost, np.zeros((n, n_step), np.uint8),
+            day.power_w_per_m2[steps].copy(), field.plate_drift_rad, field.sensor_bias_rad,
+            run.state, run.ring, run.total[0], run.by_mode[0], run.hours, day.hour[steps].astype(np.int64),
+            run.histogram, 1, error, np.zeros((n, n_step, 2)), np.arange(n), trace, run.light,
         )  # fmt: skip
-        run.state[rows], run.ring[rows] = state, ring
-        return trace[:, -1, :3], error[:, -1]
 
-    def _obey(self, control: FieldControl, steps: slice) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int8]]:
-        """Move the axes as field control says; true normals, errors and modes at the end."""
-        state, home, per_rad = self._run.state, self.field.constant[:, 15:17], self.field.constant[:, 13:15]
-        motor = slice(_kernels.MOTOR, _kernels.MOTOR + 2)
-        rate = 1e-3 * self._scenario.tracking.drive.speed_mradps
-        for i in range(steps.start, steps.stop):
-            axis = home + state[:, motor] / per_rad
-            orders = control.step(
-                i * self._servo_s, axis_rad=axis, aim_axis_rad=axis, sun_enu=self._day.sun_enu[i], wind_m_s=_CALM_MPS
-            )
-            move = (move_axes(axis, orders.target_axis_rad, self._servo_s, rate_rad_s=rate) - axis) * per_rad
-            move[self._stopped] = 0.0
-            for first in (_kernels.MOTOR, _kernels.AXIS, _kernels.GOAL):  # the gear's play is kept as it is
-                state[:, first : first + 2] += move
-        count = np.ascontiguousarray(state[:, None, _kernels.AXIS : _kernels.AXIS + 2])
-        posture = mount_kernels.posture_batch(self.field.at(0.0), self.field.constant, count, 0.0)[:, 0]
-        normal = posture[:, 2:5]
-        wanted = geometry.bisector_enu(self.field.target[:, :3] - posture[:, 5:8], self._day.sun_enu[steps.stop - 1])
-        error = 2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(normal - wanted, axis=1), 1.0))
-        return normal, error, orders.mode
+    def _obey(self, control: FieldControl, i_step: int, told: Told) -> npt.NDArray[np.int8]:
+        """Let field control say where the axes go; return the modes."""
+        home, per_rad = self.field.constant[:, 15:17].copy(), self.field.constant[:, 13:15]
+        home[:, 0] -= 2.0 * np.pi * np.rint(home[:, 0] / (2.0 * np.pi))
+        axis = home + self._run.state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / per_rad
+        orders = control.step(
+            i_step * self._servo_s, axis_rad=axis, aim_axis_rad=axis, sun_enu=self._day.sun_enu[i_step],
+            wind_m_s=_CALM_MPS,
+        )  # fmt: skip
+        goes = np.asarray(np.isfinite(orders.target_axis_rad).all(axis=1))
+        told.duty[:] = np.where(goes, _kernels.GO, _kernels.TRACK)
+        told.goal[:] = np.where(goes[:, None], (orders.target_axis_rad - home) * per_rad, 0.0)
+        return orders.mode

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.energy import Bursts, response_loss
+from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels as kernels
 from rfpose.feedback.tracking.simulation import Sums
 
@@ -29,7 +30,7 @@ class Score:
     intercept
         Light caught over light that a perfect tracker would catch.
     energy_j_per_m2
-        Light caught by a square metre of mirror, from the sky as it was.
+        Light caught by a square metre of mirror, from the sky as it was, whatever its mode.
     motor_steps, motor_starts
         By mirror and day, both axes together.
     heliostat_rms_rad, heliostat_p95_rad, heliostat_worst_rad, heliostat_intercept : (mirror,)
@@ -53,6 +54,10 @@ class Score:
         The same light, by mirror.
     turning_loss
         Part of the sunshine that would pass if mirrors turned by the error at full speed (Edwards §5.4.9).
+    by_mode : (mode, 3)
+        Seconds, light offered and caught [J/m²] by mirror, in each `Mode` while the field was to work.
+    availability
+        Light caught over light offered in all modes: what ways, alarms, calibrations and faults cost, too.
     lost_frames
         Part of the radio frames that brought nothing.
     out_of_reach
@@ -85,6 +90,8 @@ class Score:
     response_loss: float
     response_loss_j_per_m2: float
     turning_loss: float
+    by_mode: FloatArray
+    availability: float
     lost_frames: float
     out_of_reach: float
 
@@ -120,6 +127,16 @@ class Score:
                 "response_loss_kwh_per_m2": self.response_loss_j_per_m2 / 3.6e6,
                 "turning_loss": self.turning_loss,
             },
+            "availability": self.availability,
+            "modes": {
+                mode.name.lower(): {
+                    "hours": seconds / 3600.0,
+                    "offered_kwh_per_m2": offered / 3.6e6,
+                    "lost_kwh_per_m2": (offered - caught) / 3.6e6,
+                }
+                for mode, (seconds, offered, caught) in zip(Mode, self.by_mode.tolist(), strict=True)
+                if seconds > 0.0
+            },
             "lost_frames": self.lost_frames,
             "out_of_reach": self.out_of_reach,
         }
@@ -151,6 +168,7 @@ def score(sums: Sums) -> Score:
         caught = by_mirror[:, kernels.CAUGHT] / by_mirror[:, kernels.ENERGY]
         day_caught = day[:, kernels.CAUGHT] / day[:, kernels.ENERGY]
     scored = by_mirror[:, kernels.STEPS] > 0.0
+    by_mode = sums.by_mode.sum(axis=0).mean(axis=0)
     return Score(
         normal_rms_rad=float(np.sqrt(_ratio(everything[kernels.SQUARE], everything[kernels.STEPS]))),
         normal_p95_rad=float(quantile(sums.histogram.sum(axis=0)[None], 0.95)[0]),
@@ -158,7 +176,7 @@ def score(sums: Sums) -> Score:
         beam_rms_rad=float(np.sqrt(_ratio(everything[kernels.BEAM_SQUARE], everything[kernels.STEPS]))),
         beam_worst_rad=float(worst[:, kernels.BEAM_WORST].max()) if scored.any() else np.nan,
         intercept=intercept,
-        energy_j_per_m2=float(everything[kernels.CAUGHT]) / n_mirror,
+        energy_j_per_m2=float(by_mode[:, kernels.MODE_CAUGHT].sum()),
         motor_steps=float(everything[kernels.MOTOR_1] + everything[kernels.MOTOR_2]) / (n_mirror * n_day),
         motor_starts=float(everything[kernels.STARTS]) / (n_mirror * n_day),
         heliostat_rms_rad=read_only(rms),
@@ -180,6 +198,8 @@ def score(sums: Sums) -> Score:
         response_loss=_ratio(lost_j, everything[kernels.ENERGY]),
         response_loss_j_per_m2=lost_j / n_mirror,
         turning_loss=_turning_loss(everything),
+        by_mode=read_only(by_mode),
+        availability=_ratio(by_mode[:, kernels.MODE_CAUGHT].sum(), by_mode[:, kernels.MODE_OFFERED].sum()),
         lost_frames=_ratio(everything[kernels.FRAMES_LOST], everything[kernels.FRAMES]),
         out_of_reach=_ratio(
             everything[kernels.OUT_OF_REACH], everything[kernels.OUT_OF_REACH] + everything[kernels.STEPS]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +13,21 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.mount import PARAMETERS
 from rfpose.feedback.servo import PiLaw, Stepper
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
 from rfpose.feedback.servo.margins import Margins
 from rfpose.feedback.tracking import _kernels
+from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import Field, azimuth_course_rad, draw_field, generator
 from rfpose.feedback.tracking.instruments import LEARNED, Workshop
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import Method, choose
+from rfpose.feedback.tracking.operation import Operation, Told, who_of
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.sky import under_sky
-from rfpose.feedback.tracking.timeline import Day, days
+from rfpose.feedback.tracking.timeline import Day, days, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
 
@@ -34,7 +39,7 @@ SEGMENT_S = 900.0
 """Simulated time between two points at which a run can be taken up again."""
 _FORGET_OFFSET_S = 300.0
 _FIRST_SIGMA_RAD = 0.3e-3
-_SUN_RAD = 9.3e-3
+_EARTH_RADPS = 7.2921159e-5
 _FREE = np.array([list(PARAMETERS).index(name) for name in LEARNED])
 _SCALE = np.array([PARAMETERS[name] for name in LEARNED])
 
@@ -47,6 +52,8 @@ class Sums:
     ----------
     total : (day, mirror, sum)
         Sums by the kernels' names.
+    by_mode : (day, mirror, mode, 3)
+        Seconds, light offered and caught [J/m²] while the field was to work, by `Mode`.
     hours : (mirror, 24, 2)
         Steps and squared normal errors by hour of local mean solar time.
     histogram : (mirror, bin)
@@ -54,6 +61,7 @@ class Sums:
     """
 
     total: FloatArray
+    by_mode: FloatArray
     hours: FloatArray
     histogram: npt.NDArray[np.int64]
 
@@ -69,11 +77,17 @@ class Curves:
     normal_enu : (time, stored, xyz)
         True normals of the stored mirrors.
     error_rad : (time, stored)
-        Their errors.
+        Their errors; NaN while a mirror is not on the receiver.
     motor_count : (time, stored, axis)
         Motor positions.
     shift_enu : (time, stored, xyz)
         What feedback adds to the normal that the model is asked for.
+    flux : (time,)
+        Light on the receiver over that of a perfect field on its aim.
+    mode_count : (time, mode)
+        Mirrors in each `Mode`.
+    mode : (time, stored)
+        Modes of the stored mirrors.
     """
 
     rms_rad: FloatArray
@@ -83,6 +97,9 @@ class Curves:
     error_rad: FloatArray
     motor_count: FloatArray
     shift_enu: FloatArray
+    flux: FloatArray
+    mode_count: npt.NDArray[np.int32]
+    mode: npt.NDArray[np.int8]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -97,18 +114,27 @@ class _Run:
     state: FloatArray
     ring: FloatArray
     total: FloatArray
+    by_mode: FloatArray
     hours: FloatArray
     histogram: npt.NDArray[np.int64]
     curve: FloatArray
     trace: FloatArray
     stored_error: FloatArray
+    light: FloatArray
+    mode_count: npt.NDArray[np.int32]
+    mode: npt.NDArray[np.int8]
+    operation: Operation | None = None
+    happened: list[dict[str, Any]] = field(default_factory=list)
 
     def arrays(self) -> Arrays:
         """Return all that changes, by name."""
         return {name: getattr(self, name) for name in _RUN_ARRAYS}
 
 
-_RUN_ARRAYS = ("model", "cov", "state", "ring", "total", "hours", "histogram", "curve", "trace", "stored_error")
+_RUN_ARRAYS = (
+    "model", "cov", "state", "ring", "total", "by_mode", "hours", "histogram", "curve", "trace", "stored_error",
+    "light", "mode_count", "mode",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,6 +190,10 @@ class Simulation:
         self._workshop = Workshop(scenario, self.field, self.radio, self.gusts, seed=self.seed)
         self._stride = round(plan.store_interval_s / plan.servo_interval_s)
         self.segments = self._segments()
+        self._table = capture_table(scenario)
+        if plan.field_control is not None:
+            for event in plan.event:  # refuse names that nobody has before days go by
+                who_of(event, self.field, plan.field_control.bus.cluster_size)
         n = len(self.field)
         self.stored = np.unique(np.linspace(0, n - 1, min(plan.stored, n)).astype(np.int64))
         self._runs = [self._start(m) for m in self.methods]
@@ -268,9 +298,33 @@ class Simulation:
             servo_s=servo,
             level=level,
             reach=1e-3 * plan.sun_sensor.range_mrad,
-            disc=0.5 * _SUN_RAD + 1e-3 * plan.slope_error_mrad,
+            # an error of the normal moves a heliostat's image by twice itself, a dish's by once: so the tables have it
+            per_rad=(N_CAPTURE - 1) / TOP_RAD,
+            **self._sky(),
+            **self._structure(),
         )
         return loop, law
+
+    def _sky(self) -> dict[str, Any]:
+        """Return what a mirror needs to carry a sun that it heard of on."""
+        plan, site = self.scenario.tracking, site_of(self.scenario)
+        carries = plan.field_control is not None and plan.field_control.between_messages == "carried-on"
+        return {
+            "pole_n": float(np.cos(site.latitude_rad)),
+            "pole_u": float(np.sin(site.latitude_rad)),
+            "turn": _EARTH_RADPS * plan.servo_interval_s if carries else 0.0,
+        }
+
+    def _structure(self) -> dict[str, Any]:
+        """Return how the structure swings."""
+        gusts = self.gusts
+        (y_y, y_v), (v_y, v_v) = gusts.transition.tolist()
+        (root_y, _), (root_vy, root_v) = gusts.root.tolist()
+        right, up = gusts.swing_sigma_rad.tolist()
+        return {
+            "swings": gusts.swings, "y_y": y_y, "y_v": y_v, "v_y": v_y, "v_v": v_v, "root_y": root_y,
+            "root_vy": root_vy, "root_v": root_v, "swing_right": right, "swing_up": up,
+        }  # fmt: skip
 
     def _drive(self, axis: int) -> DriveNumbers:
         """Return one axis's motor and gear in counts and servo steps."""
@@ -310,11 +364,15 @@ class Simulation:
             state=np.zeros((n, _kernels.N_STATE)),
             ring=np.zeros((n, _kernels.N_RING, _kernels.N_ENTRY)),
             total=np.zeros((len(self.days), n, _kernels.N_SUM)),
+            by_mode=np.zeros((len(self.days), n, len(Mode), 3)),
             hours=np.zeros((n, 24, 2)),
             histogram=np.zeros((n, _kernels.N_BIN), np.int64),
-            curve=np.full((n_time, 3), np.nan),
+            curve=np.full((n_time, 4), np.nan),
             trace=np.full((max(len(self.stored), 1), n_time, 8), np.nan),
             stored_error=np.full((n_time, len(self.stored)), np.nan),
+            light=np.zeros((n, 2)),
+            mode_count=np.zeros((n_time, len(Mode)), np.int32),
+            mode=np.full((n_time, len(self.stored)), -1, np.int8),
         )
 
     # -- go on ---------------------------------------------------------------------------------------------
@@ -326,10 +384,8 @@ class Simulation:
         plan, n = self.scenario.tracking, len(self.field)
         if segment.first == 0:
             self._gust_state[:] = self.gusts.process.start(generator(self.seed, 1, segment.i_day), n)
-            begin = self._first_count(day)
             for run in self._runs:
                 self._begin_day(run, segment.i_day)
-                run.state[:, _kernels.NEXT] = begin
         place = (segment.i_day, segment.first)
         n_step = segment.end - segment.first
         control = round(plan.control_interval_s / plan.servo_interval_s)
@@ -346,32 +402,69 @@ class Simulation:
             errors = self.radio.errors(self._wanted_normal(day, (segment.first + segment.end) // 2), rng)
             spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
             lost[~errors.solved] = 1
-        true = self.field.at(day.since_first)
+        draws = _Draws(
+            gust=gust,
+            swing=self.gusts.draw_swing(rng, (n, n_step)),
+            noise=noise,
+            lost=lost,
+            outage=outage,
+            spread=spread,
+            bias=bias,
+        )
+        for run in self._runs:
+            self._go_through(run, segment, draws)
+            if run.operation is not None and (segment.end == len(day.unix_s)):
+                self._end_day(run, segment.i_day)
+        self.done += 1
+
+    def _go_through(self, run: _Run, segment: _Segment, draws: _Draws) -> None:
+        """Take one method through a stretch: at once, or from word to word of its field control."""
+        day, field = self.days[segment.i_day], self.field
+        n, n_step = len(field), segment.end - segment.first
+        steps = slice(segment.first, segment.end)
         stored = np.full(n, -1, np.int64)
         stored[self.stored] = np.arange(len(self.stored))
         n_stored = -(-n_step // self._stride)
-        steps = slice(segment.first, segment.end)
-        for run in self._runs:
-            error = np.full((n, n_stored), np.nan)
-            trace = np.full((max(len(self.stored), 1), n_stored, 8), np.nan)
-            loop = run.loop
-            is_sensor = run.method.feedback == _kernels.SUN_SENSOR
-            drift = self._sensor_drift() if is_sensor else self.field.plate_drift_rad
+        error, light = np.full((n, n_stored), np.nan), np.zeros((n, n_stored, 2))
+        trace = np.full((max(len(self.stored), 1), n_stored, 8), np.nan)
+        is_sensor = run.method.feedback == _kernels.SUN_SENSOR
+        drift = self._sensor_drift() if is_sensor else field.plate_drift_rad
+        true = field.at(day.since_first)
+        cov = run.cov if run.method.learns else np.broadcast_to(run.cov, (n, *run.cov.shape[1:])).copy()
+        heat, power, hour_of = day.heat[steps].copy(), _power(day)[steps].copy(), day.hour[steps].astype(np.int64)
+        sun = day.sun_enu[segment.first : segment.end + run.loop.interval + 1].copy()
+        drives, walk = (self._drive(0), self._drive(1)), self._walk()
+        told = Told.always_track(field)
+        s = 0
+        while s < n_step:
+            end = n_step
+            if run.operation is not None:
+                _home(true, field.at(day.since_first), run.operation)
+                told = run.operation.tell(
+                    segment.first + s, first_of=segment.first, state=run.state, model=run.model, true=true,
+                    light=run.light, gust=draws.gust,
+                )  # fmt: skip
+                end = run.operation.until(segment.first + s, segment.end) - segment.first
+                _home(true, field.at(day.since_first), run.operation)
+            if run.operation is None or s % self._stride == 0:
+                at = slice(segment.first_stored + s // self._stride, segment.first_stored + -(-end // self._stride))
+                run.mode_count[at] = np.bincount(told.mode, minlength=len(Mode))
+                run.mode[at] = told.mode[self.stored]
             _kernels.advance(
-                loop, run.law, self._drive(0), self._drive(1),
-                segment.first, true, self.field.constant, self.field.lean_rad, day.heat[steps].copy(), run.model,
-                np.broadcast_to(run.cov, (n, *run.cov.shape[1:])).copy() if not run.method.learns else run.cov,
-                _FREE, _SCALE, self._walk(), day.sun_enu[segment.first : segment.end + loop.interval + 1].copy(),
-                self.field.target, gust, self.gusts.mean_mps, self.gusts.bend, noise, spread, bias, lost, outage,
-                day.power_w_per_m2[steps].copy(), drift, self.field.sensor_bias_rad,
-                run.state, run.ring, run.total[segment.i_day], run.hours, day.hour[steps].astype(np.int64),
-                run.histogram, self._stride, error, stored, trace,
+                run.loop, run.law, *drives, self._table,
+                segment.first, s, end, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
+                told.age, true, field.constant, field.lean_rad, heat, run.model, cov, _FREE, _SCALE, walk, sun,
+                field.target, draws.gust, self.gusts.mean_mps, self.gusts.bend, draws.swing, draws.noise, draws.spread,
+                draws.bias, draws.lost, draws.outage, power, drift, field.sensor_bias_rad,
+                run.state, run.ring, run.total[segment.i_day], run.by_mode[segment.i_day], run.hours, hour_of,
+                run.histogram, self._stride, error, light, stored, trace, run.light,
             )  # fmt: skip
-            at = slice(segment.first_stored, segment.first_stored + n_stored)
-            run.curve[at] = _over_field(error)
-            run.trace[:, at] = trace
-            run.stored_error[at] = error[self.stored].T
-        self.done += 1
+            s = end
+        at = slice(segment.first_stored, segment.first_stored + n_stored)
+        run.curve[at, :3] = _over_field(error)
+        run.curve[at, 3] = light[..., 0].sum(axis=0) / light[..., 1].sum(axis=0)
+        run.trace[:, at] = trace
+        run.stored_error[at] = error[self.stored].T
 
     def _first_count(self, day: Day) -> FloatArray:
         """Return about where azimuth motors begin a day, on the turn that leaves its course nearest to the middle."""
@@ -385,12 +478,31 @@ class Simulation:
         day = self.days[i_day]
         run.state[:] = 0.0
         run.ring[:] = 0.0
+        run.light[:] = 0.0
+        run.state[:, _kernels.NEXT] = self._first_count(day)
+        run.operation = self._operation(run.method, i_day)
+        if run.operation is not None:
+            run.operation.park(run.state)
         if run.method.learns and i_day > 0:
             passed = day.since_first - self.days[i_day - 1].since_first
             sigma = 1e-3 * self.scenario.tracking.radio_model.forget_mrad_per_sqrt_day
             run.cov[:, np.arange(len(_FREE)), np.arange(len(_FREE))] += sigma**2 * passed
             return
         run.model[:] = self._workshop.model(run.method, day)
+
+    def _operation(self, method: Method, i_day: int) -> Operation | None:
+        if self.scenario.tracking.field_control is None:
+            return None
+        return Operation(
+            self.scenario, self.field, self.gusts, self.days[i_day], i_day=i_day, feedback=method.feedback,
+            seed=self.seed,
+        )  # fmt: skip
+
+    def _end_day(self, run: _Run, i_day: int) -> None:
+        """Keep what field control has to tell of a day."""
+        assert run.operation is not None
+        run.operation.end()
+        run.happened.append({"day": str(self.days[i_day].date)} | run.operation.report())
 
     def _walk(self) -> FloatArray:
         """Variance that the rolling fit adds to each parameter at a step."""
@@ -422,7 +534,16 @@ class Simulation:
     def sums(self, name: str) -> Sums:
         """Return what a method's mirrors have added up to so far."""
         run = self._run(name)
-        return Sums(total=read_only(run.total), hours=read_only(run.hours), histogram=read_only(run.histogram))
+        return Sums(
+            total=read_only(run.total),
+            by_mode=read_only(run.by_mode),
+            hours=read_only(run.hours),
+            histogram=read_only(run.histogram),
+        )
+
+    def happened(self, name: str) -> list[dict[str, Any]]:
+        """Return what a method's field control has to tell of each day that is over; empty without field control."""
+        return list(self._run(name).happened)
 
     def curves(self, name: str) -> Curves:
         """Return a method's courses so far."""
@@ -436,6 +557,9 @@ class Simulation:
             error_rad=read_only(run.stored_error),
             motor_count=read_only(trace[..., 3:5]),
             shift_enu=read_only(trace[..., 5:8]),
+            flux=read_only(run.curve[:, 3]),
+            mode_count=read_only(run.mode_count),
+            mode=read_only(run.mode),
         )
 
     def _run(self, name: str) -> _Run:
@@ -447,16 +571,51 @@ class Simulation:
         """Return all that going on depends on."""
         found: Arrays = {"done": np.array(self.done), "gust": self._gust_state}
         for run in self._runs:
-            found |= {f"{run.method.name}/{name}": values for name, values in run.arrays().items()}
+            arrays = run.arrays() | {"happened": np.frombuffer(json.dumps(run.happened).encode(), np.uint8).copy()}
+            if run.operation is not None:
+                arrays |= {f"operation/{name}": values for name, values in run.operation.state().items()}
+            found |= {f"{run.method.name}/{name}": values for name, values in arrays.items()}
         return found
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
         """Go back to what `state` gave, of a run with the same arguments."""
         self.done = int(state["done"])
         self._gust_state[:] = state["gust"]
+        i_day = self.segments[max(self.done - 1, 0)].i_day
         for run in self._runs:
-            for name, values in run.arrays().items():
-                values[...] = state[f"{run.method.name}/{name}"]
+            name = run.method.name
+            for key, values in run.arrays().items():
+                values[...] = state[f"{name}/{key}"]
+            run.happened = json.loads(bytes(state[f"{name}/happened"]).decode())
+            place = f"{name}/operation/"
+            kept = {key[len(place) :]: values for key, values in state.items() if key.startswith(place)}
+            if kept:
+                run.operation = self._operation(run.method, i_day)
+                assert run.operation is not None
+                run.operation.restore(kept)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Draws:
+    """What a stretch of time brings to all methods alike; see `_kernels.advance`."""
+
+    gust: npt.NDArray[np.float32]
+    swing: npt.NDArray[np.float32]
+    noise: npt.NDArray[np.float32]
+    lost: npt.NDArray[np.uint8]
+    outage: npt.NDArray[np.uint8]
+    spread: FloatArray
+    bias: FloatArray
+
+
+def _power(day: Day) -> FloatArray:
+    """Return the beam as the kernels want it: negative while the field is not to work."""
+    return np.where(day.works, day.power_w_per_m2, -1.0)
+
+
+def _home(true: FloatArray, built: FloatArray, operation: Operation) -> None:
+    """Let the true zeros of the axes be where homing left them."""
+    true[:, 3:5] = built[:, 3:5] + operation.homing_rad
 
 
 def _over_field(error: FloatArray) -> FloatArray:

@@ -13,8 +13,9 @@ from rfpose.errors import ScenarioError
 from rfpose.feedback.energy import clear_beam_w_m2
 from rfpose.feedback.sun import Site, sun_position
 from rfpose.scenario import Scenario
+from rfpose.scenario.tracking import Tracking
 
-__all__ = ["Day", "day_of", "days", "hour_of_day", "site_of"]
+__all__ = ["Day", "day_of", "days", "hour_of_day", "site_of", "ways_s"]
 
 _COARSE_S = 20.0
 _MARGIN_S = 120.0
@@ -38,6 +39,10 @@ class Day:
         Beam of the sun, under a clear sky unless `sky.under_sky` has laid clouds on it [W/m²].
     hour : (step,)
         Local mean solar time [h].
+    works : (step,)
+        Whether the field is to collect; before and after that mirrors come out of stow and go back.
+    from_stow
+        Whether the mirrors begin in stow: the hours are not cut from the middle of the day.
     """
 
     date: datetime.date
@@ -46,6 +51,8 @@ class Day:
     sun_enu: FloatArray
     power_w_per_m2: FloatArray
     hour: FloatArray
+    works: npt.NDArray[np.bool_]
+    from_stow: bool
 
     @property
     def heat(self) -> FloatArray:
@@ -106,14 +113,16 @@ def day_of(scenario: Scenario, date: datetime.date, since_first: int, *, whole: 
             "another `date`, hours, or a lower `min_sun_elevation_deg`"
         )
     begin, end = np.ceil(coarse[up][0]), coarse[up][-1]
+    from_stow = plan.field_control is not None and not whole and not up[0]
+    way = ways_s(plan) if from_stow else 0.0, ways_s(plan) if plan.field_control and not whole and not up[-1] else 0.0
     lead = max(round(plan.control_interval_s / plan.servo_interval_s), 1) + 1
     # whole frames, so that every stretch of the day begins with one
-    n_step = max(int((end - begin) / plan.control_interval_s), 1) * (lead - 1)
-    times = begin + plan.servo_interval_s * np.arange(n_step + lead)
+    n_step = max(int((end - begin + sum(way)) / plan.control_interval_s), 1) * (lead - 1)
+    times = begin - way[0] + plan.servo_interval_s * np.arange(n_step + lead)
     # the sun's path is smooth: exact every minute, a cubic through the points between
     from scipy.interpolate import CubicSpline
 
-    knots = np.arange(begin - _MARGIN_S, times[-1] + _MARGIN_S, 60.0)
+    knots = np.arange(times[0] - _MARGIN_S, times[-1] + _MARGIN_S, 60.0)
     direction = CubicSpline(knots, sun_position(knots, site).direction_enu)(times)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     elevation = np.arcsin(np.clip(direction[:n_step, 2], -1.0, 1.0))
@@ -124,4 +133,15 @@ def day_of(scenario: Scenario, date: datetime.date, since_first: int, *, whole: 
         sun_enu=read_only(direction),
         power_w_per_m2=read_only(clear_beam_w_m2(elevation, site=site)),
         hour=read_only(hour_of_day(times[:n_step], site)),
+        works=read_only((times[:n_step] >= begin) & (times[:n_step] <= end)),
+        from_stow=from_stow,
     )
+
+
+def ways_s(plan: Tracking) -> float:
+    """Return how long the farthest way out of stow or back takes, one axis after the other, with some to spare [s].
+
+    Whole control intervals.
+    """
+    longest = 1.5 * np.pi / (1e-3 * plan.drive.speed_mradps)
+    return float(np.ceil((1.1 * longest + 60.0) / plan.control_interval_s) * plan.control_interval_s)

@@ -9,10 +9,13 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
+from rfpose.feedback.structure import Structure, swing_transition
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.feedback.wind.gusts import gust_process
 from rfpose.feedback.wind.record import WindRecord, read_wind_csv
+from rfpose.feedback.wind.spectrum import wind_deflection
 from rfpose.scenario import Scenario
+from rfpose.scenario.tracking import Tracking
 
 __all__ = ["Gusts"]
 
@@ -22,6 +25,22 @@ _BLOCK = 2000
 
 class Gusts:
     """Gusts about a steady wind, one series a mirror, and the deflection that they cause.
+
+    What is slower than the structure's mode bends it as if it were stiff (5.20); what excites the mode lets it swing
+    with the variance of (5.19).
+
+    Attributes
+    ----------
+    mean_mps
+        Steady wind; of a record the root of its mean square [m/s].
+    bend : (2,)
+        Deflection in a steady wind of 1 m/s, right and up [rad/(m/s)²].
+    swings
+        Whether the structure has a mode.
+    swing_sigma_rad : (2,)
+        Standard deviation of its swing by wind, right and up [rad].
+    transition, root : (2, 2)
+        See `rfpose.feedback.structure.swing_transition`.
 
     References
     ----------
@@ -39,12 +58,26 @@ class Gusts:
         self.process = gust_process(
             self.mean_mps, interval_s=plan.servo_interval_s, size_m=float(np.sqrt(plan.mirror_area_m2))
         )
+        self.swings = plan.structure.natural_hz > 0.0
+        self.swing_sigma_rad: FloatArray = np.zeros(2)
+        self.transition, self.root = np.zeros((2, 2)), np.zeros((2, 2))
+        if self.swings:
+            self._structure(plan)
+
+    def _structure(self, plan: Tracking) -> None:
+        mode = Structure(natural_hz=plan.structure.natural_hz, damping=plan.structure.damping)
+        self.transition, self.root = swing_transition(mode, interval_s=plan.servo_interval_s)
+        if self.mean_mps > 0.0:
+            size_m = float(np.sqrt(plan.mirror_area_m2))
+            resonant = wind_deflection(1.0, self.mean_mps, mode, size_m=size_m)[1]
+            self.swing_sigma_rad = np.sqrt(float(resonant)) * self.bend
 
     @property
     def variance_rad2(self) -> float:
         """Mean variance of the deflection, right and up, the steady part left out [rad²]."""
         sigma = self.process.sigma_mps if self._record is None else float(np.std(self._recorded()))
-        return float(np.mean((2.0 * self.mean_mps * sigma * self.bend) ** 2))
+        slow = (2.0 * self.mean_mps * sigma * self.bend) ** 2
+        return float(np.mean(slow + self.swing_sigma_rad**2))
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
         """Return gusts that know nothing of each other [m/s]."""
@@ -75,6 +108,29 @@ class Gusts:
                     f"[tracking.wind] `record` does not reach over {day.date}: give a longer one, another `date`, or "
                     "`first_hour` and `last_hour` within it"
                 )
+
+    def draw_swing(self, rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+        """Return what excites the swing of mirrors (*shape, 4), of variance one; of a stiff structure nothing."""
+        return rng.standard_normal((*shape, 4) if self.swings else (*shape[:-1], 0, 4), dtype=np.float32)
+
+    def swing_rad(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
+        """Return swings that know nothing of each other, right and up (*shape, 2) [rad]."""
+        if not self.swings:
+            return np.zeros((*shape, 2))
+        return np.asarray(self.swing_sigma_rad * rng.standard_normal((*shape, 2)))
+
+    def speed_mps(self, gust_mps: FloatArray) -> FloatArray:
+        """Return the wind's speed with gusts as `run` gives them [m/s]."""
+        if self._record is None:
+            return np.maximum(self.mean_mps + gust_mps, 0.0)
+        return np.sqrt(np.maximum(self.mean_mps**2 + 2.0 * self.mean_mps * gust_mps, 0.0))
+
+    def known(self, unix_s: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return whether the wind is known at times (time,): not in gaps of a record."""
+        if self._record is None:
+            return np.ones(len(unix_s), np.bool_)
+        nearest = np.interp(unix_s, self._record.unix_s, np.arange(len(self._record.unix_s)))
+        return np.asarray(np.isfinite(self._record.speed_mps[np.rint(nearest).astype(np.int64)]))
 
     def bend_rad(self, gust_mps: FloatArray) -> FloatArray:
         """Return the deflection of normals, right and up (…, 2) [rad]."""

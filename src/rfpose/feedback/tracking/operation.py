@@ -1,0 +1,455 @@
+"""A day under field control: what each mirror of one method is told, from stow to stow, and what happens on the way.
+
+`rfpose.feedback.fieldcontrol` has the modes, the buses and the local controllers. Here stand the plant's programme (out
+of stow in the morning, back in the evening and again once an alarm is over), the events of the scenario, calibrations
+on the target, and the link to the kernel that moves the mirrors.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.errors import ScenarioError
+from rfpose.feedback import _kernels as mount_kernels
+from rfpose.feedback.fieldcontrol.bus import BusSettings
+from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings, Orders
+from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.mount import aim_rows
+from rfpose.feedback.tracking import _kernels
+from rfpose.feedback.tracking.campaign import Campaign
+from rfpose.feedback.tracking.hidden import Field, generator
+from rfpose.feedback.tracking.timeline import Day
+from rfpose.feedback.tracking.watch import AlarmWatch
+from rfpose.feedback.tracking.wind import Gusts
+from rfpose.scenario import Scenario
+from rfpose.scenario.tracking import Event as Happening
+
+__all__ = ["Operation", "Told", "who_of"]
+
+_LATE_INTERVALS = 1.5
+"""From a round to the middle of the interval in which its sun is used."""
+_SILENT_FRAMES = 5.0
+_COMMANDS = {
+    "stow": Event.STOW,
+    "approach": Event.APPROACH,
+    "point": Event.POINT,
+    "track": Event.TRACK,
+    "defocus": Event.DEFOCUS,
+    "refocus": Event.REFOCUS,
+    "hold": Event.HOLD,
+    "zero-counts": Event.ZERO_COUNTS,
+}
+_FOLLOWS = np.isin(np.arange(len(Mode)), [Mode.POINT, Mode.TRACK, Mode.CALIBRATE, Mode.SEARCH, Mode.DEFOCUS])
+_ON_RECEIVER = np.isin(np.arange(len(Mode)), [Mode.POINT, Mode.TRACK])
+_BACK = (Mode.STOW, Mode.STOWING, Mode.POWER_LOSS, Mode.FAULT)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What mirrors are told until the next word; see `_kernels.advance`."""
+
+    duty: npt.NDArray[np.int64]
+    renew: npt.NDArray[np.uint8]
+    scored: npt.NDArray[np.uint8]
+    mode: npt.NDArray[np.int64]
+    aim: FloatArray
+    goal: FloatArray
+    heard: FloatArray
+    age: FloatArray
+
+    @classmethod
+    def always_track(cls, field: Field) -> Told:
+        """Return what mirrors do without field control: track their aim, by a sun that is known."""
+        n = len(field)
+        return cls(
+            duty=np.full(n, _kernels.TRACK),
+            renew=np.zeros(n, np.uint8),
+            scored=np.ones(n, np.uint8),
+            mode=np.full(n, int(Mode.TRACK)),
+            aim=field.target[:, :3].copy(),
+            goal=np.zeros((n, 2)),
+            heard=np.zeros((n, 3)),
+            age=np.full(n, np.nan),
+        )
+
+
+class Operation:
+    """One day of one method under field control.
+
+    Parameters
+    ----------
+    scenario, field, gusts
+        The run.
+    day, i_day
+        The day, and which of the run it is.
+    feedback
+        What the method measures, by the kernels' number.
+    seed
+        Of the run: all methods begin the day with the same buses.
+    """
+
+    def __init__(
+        self, scenario: Scenario, field: Field, gusts: Gusts, day: Day, *, i_day: int, feedback: int, seed: int
+    ) -> None:
+        plan = scenario.tracking
+        assert plan.field_control is not None
+        self._plan, self._field, self._day, self._feedback, self._seed = plan, field, day, feedback, seed
+        self._servo_s = plan.servo_interval_s
+        self._interval = round(plan.control_interval_s / self._servo_s)
+        self._held = plan.field_control.between_messages == "held"
+        n = len(field)
+        step_rad = 2.0 * np.pi / plan.drive.steps_per_turn * (plan.drive.microsteps + plan.drive.dead_band_steps)
+        self.control = FieldControl(
+            aim_enu_m=field.target[:, :3],
+            pivot_enu_m=field.pivot_enu_m,
+            calibration_enu_m=plan.calibration_target_enu_m,
+            settings=settings_of(scenario, arrived_rad=max(2e-3, 2.0 * step_rad)),
+            bus=bus_of(scenario),
+            mode=Mode.STOW if day.from_stow else Mode.TRACK,
+            rng=generator(seed, 40, i_day),
+        )
+        self._wind_mps = _Wind(gusts, round(plan.field_control.wind_average_s / self._servo_s), day)
+        self._events = _agenda(plan.event, day, i_day + 1, field, plan.field_control.bus.cluster_size)
+        self._works_until = int(np.flatnonzero(day.works)[-1])
+        self._home, self._per_rad = field.constant[:, 15:17].copy(), field.constant[:, 13:15]
+        # the turn on which the park position lies within half a turn of the middle of the travel
+        self._home[:, 0] -= 2.0 * np.pi * np.rint(self._home[:, 0] / (2.0 * np.pi))
+        self.campaign = Campaign(scenario, field, feedback=feedback, seed=seed)
+        self.watch = AlarmWatch(n)
+        self._out = np.ones(n, np.bool_)
+        self._centre_dead = False
+        self._next_event = 0
+        self._last_duty = np.full(n, -1, np.int64)
+        self._last_aim = np.full((n, 3), np.nan)
+        self._last_mode = self.control.mode
+        self.log: list[dict[str, Any]] = []
+        self.homing_rad = np.zeros((n, 2))
+
+    # -- beginning -----------------------------------------------------------------------------------------
+
+    def park(self, state: FloatArray) -> None:
+        """Put motors where they stand in stow, if the day begins there."""
+        if not self._day.from_stow:
+            return
+        stow = (np.array(self.control.settings.stow_axis_rad) - self._home) * self._per_rad
+        step = float(self._plan.drive.microsteps)
+        for at in (_kernels.MOTOR, _kernels.AXIS, _kernels.GOAL):
+            state[:, at : at + 2] = np.rint(stow / step) * step
+        state[:, _kernels.STARTED] = 1.0
+
+    # -- going on ------------------------------------------------------------------------------------------
+
+    def tell(
+        self, s: int, *, first_of: int, state: FloatArray, model: FloatArray, true: FloatArray, light: FloatArray,
+        gust: npt.NDArray[np.float32],
+    ) -> Told:  # fmt: skip
+        """Let messages pass until step ``s`` of the day and return what the mirrors are told from there on.
+
+        Parameters
+        ----------
+        s, first_of
+            The step, and the first one of its stretch, with which ``gust`` begins.
+        state, model
+            Of the method's mirrors, as the kernels have them; a calibration changes the model, a homing the counts.
+        true : (mirror, 34)
+            Mounts as they are, what homing made of them included.
+        light : (mirror, 2)
+            Light caught and offered at the step before.
+        gust : (mirror, step)
+            Of the stretch [m/s].
+        """
+        now = s * self._servo_s
+        axis = self._home + state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / self._per_rad
+        self._let_happen(s, now, light)
+        self._programme(s)
+        self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, true)
+        orders = self.control.step(
+            now,
+            axis_rad=axis,
+            aim_axis_rad=self._aim_axis_rad(s, state, model),
+            sun_enu=self._day.sun_enu[s],
+            wind_m_s=self._wind_mps.at(s, first_of, gust),
+            feedback_valid=self._valid(state),
+            found=self.campaign.found,
+        )
+        self._home_counts(orders.mode, state, s)
+        self.watch.observe(now, orders.mode, light, orders.alarms)
+        return self._told(orders, state)
+
+    def until(self, s: int, end: int) -> int:
+        """Return the step up to which what was told at step ``s`` holds: a second, or a control interval in quiet."""
+        tick = (s // self._interval + 1) * self._interval
+        if self._next_event < len(self._events):
+            tick = min(tick, max(self._events[self._next_event][0], s + 1))
+        quiet = self.control.quiet_until(tick * self._servo_s) >= tick * self._servo_s
+        return min(tick if quiet and not self.watch.open else s + 1, end)
+
+    def end(self) -> None:
+        """Close what is under way at the end of the day."""
+        self.watch.close()
+
+    def report(self) -> dict[str, Any]:
+        """Return the day in plain values: events, alarms, calibrations, messages."""
+        return {
+            "events": self.log,
+            "alarms": self.watch.found,
+            "calibrations": self.campaign.results,
+            "messages": self.control.messages.as_dict(),
+        }
+
+    def _told(self, orders: Orders, state: FloatArray) -> Told:
+        mode = orders.mode.astype(np.int64)
+        follows = _FOLLOWS[mode] & np.isfinite(orders.sun_enu).all(axis=1)
+        duty = np.where(follows, np.where(mode == Mode.POINT, _kernels.FOLLOW, _kernels.TRACK), _kernels.GO)
+        aim = np.where(follows[:, None], orders.aim_enu_m, self._field.target[:, :3])
+        goal = (orders.target_axis_rad - self._home) * self._per_rad
+        # who has not heard of the sun yet stands
+        goal = np.where(np.isfinite(goal), goal, state[:, _kernels.MOTOR : _kernels.MOTOR + 2])
+        renew = follows & ((self._last_duty == _kernels.GO) | (aim != self._last_aim).any(axis=1))
+        self._last_duty, self._last_aim = duty, aim
+        late_s = _LATE_INTERVALS * self._interval * self._servo_s if self._held else 0.0
+        age = np.maximum((orders.sun_age_s - late_s) / self._servo_s, 0.0)
+        return Told(
+            duty=duty,
+            renew=renew.astype(np.uint8),
+            scored=(_ON_RECEIVER[mode] & follows).astype(np.uint8),
+            mode=mode,
+            aim=aim,
+            goal=goal,
+            heard=np.where(follows[:, None], orders.sun_enu, 0.0),
+            age=np.where(follows, age, 0.0),
+        )
+
+    def _valid(self, state: FloatArray) -> npt.NDArray[np.bool_]:
+        """Whether normals are measured: single lost frames do not count."""
+        if self._feedback == _kernels.NO_FEEDBACK:
+            return np.zeros(len(state), np.bool_)
+        most = _SILENT_FRAMES if self._feedback == _kernels.RADIO else 0.0
+        return np.asarray(state[:, _kernels.SILENT] <= most)
+
+    def _aim_axis_rad(self, s: int, state: FloatArray, model: FloatArray) -> FloatArray:
+        """Where mirrors on approach have to go, by their method's model; NaN for the others."""
+        axis = np.full((len(state), 2), np.nan)
+        index = np.flatnonzero(self.control.mode == Mode.APPROACH)
+        if index.size:
+            count = aim_count(
+                model[index], self._field.constant[index], self._day.sun_enu[s], self._field.target[index]
+            )
+            turn = 2.0 * np.pi * self._per_rad[index, 0]
+            count[:, 0] += turn * np.rint((state[index, _kernels.NEXT] - count[:, 0]) / turn)
+            axis[index] = self._home[index] + count / self._per_rad[index]
+        return axis
+
+    # -- what the plant orders -----------------------------------------------------------------------------
+
+    def _programme(self, s: int) -> None:
+        """Send mirrors out by day and into stow when the day is over."""
+        if self._centre_dead:
+            return
+        reported, free = self.control.reported_mode, ~self.control.waiting
+        if s > self._works_until:
+            self._order(Event.STOW, free & ~np.isin(reported, _BACK))
+        elif not self.control.alarms:
+            self._order(Event.APPROACH, free & self._out & (reported == Mode.STOW))
+            self._order(Event.STOW, free & self._out & (reported == Mode.IDLE))
+
+    def _order(self, command: Event, to: npt.NDArray[np.bool_]) -> None:
+        if to.any():
+            self.control.command(command, to)
+
+    def _let_happen(self, s: int, now_s: float, light: FloatArray) -> None:
+        while self._next_event < len(self._events) and self._events[self._next_event][0] <= s:
+            _, event, who = self._events[self._next_event]
+            self._next_event += 1
+            entry: dict[str, Any] = {"what": event.what, "hour": event.hour, "heliostats": int(who.sum())}
+            reasons = self._do(event, who)
+            if reasons:
+                entry["refused"] = reasons
+            if event.what == "emergency":
+                self.watch.begin(now_s, "emergency", light)
+            self.log.append(entry)
+
+    def _do(self, event: Happening, who: npt.NDArray[np.bool_]) -> dict[str, int]:
+        """Let an event happen; return how many mirrors refuse an order, by reason."""
+        control = self.control
+        if event.what in _COMMANDS:
+            if event.what in ("stow", "approach"):
+                self._out[who] = event.what == "approach"
+            return _counted(control.command(_COMMANDS[event.what], who).reasons)
+        if event.what == "calibrate":
+            self.campaign.queue(np.flatnonzero(who))
+        elif event.what in ("emergency", "release", "centre-fails", "centre-returns"):
+            if self._centre_dead and event.what == "emergency":
+                return {"the centre is dead": len(who)}
+            {"emergency": control.emergency, "release": control.release, "centre-fails": control.fail_centre,
+             "centre-returns": control.repair_centre}[event.what]()  # fmt: skip
+            self._centre_dead = {"centre-fails": True, "centre-returns": False}.get(event.what, self._centre_dead)
+        elif event.what == "power-fails":
+            control.power_off(who)
+        elif event.what == "power-returns":
+            control.power_on(who & (control.mode == Mode.POWER_LOSS))
+        elif event.what == "counts-lost":
+            control.power_off(who)
+            control.power_on(who, counts_kept=False)
+        else:
+            assert event.cluster is not None
+            (control.fail_cluster if event.what == "cluster-fails" else control.repair_cluster)(event.cluster)
+        return {}
+
+    def _home_counts(self, mode: npt.NDArray[np.int8], state: FloatArray, s: int) -> None:
+        """Mirrors whose counts were zeroed count from where the switch is, which is a little beside."""
+        index = np.flatnonzero((self._last_mode == Mode.FAULT) & (mode == Mode.IDLE))
+        self._last_mode = mode
+        if not index.size:
+            return
+        assert self._plan.field_control is not None
+        draw = generator(self._seed, 42, s).standard_normal((len(state), 2))[index]
+        off = 1e-3 * self._plan.field_control.homing_sigma_mrad * draw
+        self.homing_rad[index] += off
+        for at in (_kernels.MOTOR, _kernels.AXIS, _kernels.GOAL):
+            state[index, at : at + 2] -= off * self._per_rad[index]
+
+    # -- interruption --------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return all that going on depends on."""
+        text = {"log": self.log, "next": self._next_event, "dead": self._centre_dead}
+        text |= {"campaign": self.campaign.text(), "watch": self.watch.text(), "wind": self._wind_mps.past}
+        own = {
+            "out": self._out, "duty": self._last_duty, "aim": self._last_aim, "mode": self._last_mode,
+            "homing": self.homing_rad, "text": np.frombuffer(json.dumps(text).encode(), np.uint8).copy(),
+        }  # fmt: skip
+        parts = (("own", own), ("watch", self.watch.arrays()), ("control", self.control.state()))
+        return {f"{part}.{name}": values for part, arrays in parts for name, values in arrays.items()}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go back to what `state` gave, of the same day and method."""
+
+        def part(name: str) -> dict[str, npt.NDArray[Any]]:
+            return {key[len(name) + 1 :]: v for key, v in state.items() if key.startswith(f"{name}.")}
+
+        own = part("own")
+        self._out, self._last_duty, self._last_aim = own["out"].copy(), own["duty"].copy(), own["aim"].copy()
+        self._last_mode, self.homing_rad = own["mode"].copy(), own["homing"].copy()
+        text = json.loads(bytes(own["text"]).decode())
+        self.log, self._next_event, self._centre_dead = text["log"], text["next"], text["dead"]
+        self.campaign.restore(text["campaign"])
+        self._wind_mps.past = text["wind"]
+        self.watch.restore(part("watch"), text["watch"])
+        self.control.restore(part("control"))
+
+
+class _Wind:
+    """Wind by the station, which stands at the first mirror, averaged as wind stow wants it.
+
+    Only samples once a control interval or second come in, as field control is stepped; the average is over those.
+    """
+
+    def __init__(self, gusts: Gusts, n_average: int, day: Day) -> None:
+        self._gusts, self._n_average = gusts, max(n_average, 1)
+        self._known = gusts.known(day.unix_s)
+        self.past: list[tuple[int, float]] = []
+
+    def at(self, s: int, first_of: int, gust: npt.NDArray[np.float32]) -> float:
+        """Return the average up to a step [m/s]; NaN: unknown now."""
+        self.past.append((s, float(self._gusts.speed_mps(gust[:1, s - first_of].astype(np.float64))[0])))
+        self.past = [each for each in self.past if each[0] > s - self._n_average]
+        if not self._known[s]:
+            return float("nan")
+        # each sample stands for the time until the next one
+        times = np.array([each[0] for each in self.past] + [s + 1])
+        speeds = np.array([each[1] for each in self.past])
+        return float(np.average(speeds, weights=np.diff(times)))
+
+
+def bus_of(scenario: Scenario) -> BusSettings:
+    """Return the buses of a scenario with field control."""
+    plan = scenario.tracking
+    assert plan.field_control is not None
+    return BusSettings(control_interval_s=plan.control_interval_s, **plan.field_control.bus.model_dump())
+
+
+def settings_of(scenario: Scenario, *, arrived_rad: float) -> FieldSettings:
+    """Return the behaviour of field control that a scenario asks for."""
+    plan = scenario.tracking.field_control
+    assert plan is not None
+    return FieldSettings(
+        stow_axis_rad=(float(np.deg2rad(plan.stow_deg[0])), float(np.deg2rad(plan.stow_deg[1]))),
+        arrived_rad=arrived_rad,
+        emergency_hold_s=plan.emergency_hold_s,
+        watchdog_intervals=plan.watchdog_intervals,
+        defocus_offset_m=plan.defocus_offset_m,
+        search_step_m=0.5 * plan.calibration_target_m,
+        search_dwell_s=plan.search_dwell_s,
+        search_cells=plan.search_cells,
+        wind_stow_m_s=plan.wind_stow_mps,
+        wind_release_m_s=plan.wind_release_mps,
+        wind_release_s=plan.wind_release_s,
+    )
+
+
+def who_of(event: Happening, field: Field, cluster_size: int) -> npt.NDArray[np.bool_]:
+    """Return which mirrors an event concerns (mirror,).
+
+    Raises
+    ------
+    ScenarioError
+        A name or a cluster that the field does not have.
+    """
+    n = len(field)
+    if event.cluster is not None:
+        n_cluster = -(-n // cluster_size)
+        if event.cluster >= n_cluster:
+            raise ScenarioError(
+                f"event `{event.what}` at {event.hour:g} h names cluster {event.cluster}; {n} heliostats make clusters "
+                f"0 to {n_cluster - 1}"
+            )
+        return np.asarray(np.arange(n) // cluster_size == event.cluster)
+    if not event.heliostats:
+        return np.ones(n, np.bool_)
+    row = {name: i for i, name in enumerate(field.ids)}
+    missing = [name for name in event.heliostats if name not in row]
+    if missing:
+        raise ScenarioError(
+            f"event `{event.what}` at {event.hour:g} h names heliostat {missing[0]!r}, which is not tracked; tracked "
+            f"are {field.ids[0]} to {field.ids[-1]}"
+        )
+    who = np.zeros(n, np.bool_)
+    who[[row[name] for name in event.heliostats]] = True
+    return who
+
+
+def _agenda(
+    events: tuple[Happening, ...], day: Day, number: int, field: Field, cluster_size: int
+) -> list[tuple[int, Happening, npt.NDArray[np.bool_]]]:
+    """Return a day's events in order: step, event, whom it concerns."""
+    found = []
+    for event in events:
+        who = who_of(event, field, cluster_size)
+        if event.day in (None, number):
+            found.append((int(np.searchsorted(day.hour, event.hour)), event, who))
+    return sorted(found, key=lambda each: each[0])
+
+
+def aim_count(model: FloatArray, constant: FloatArray, sun_enu: FloatArray, target: FloatArray) -> FloatArray:
+    """Return motor counts at which models send the sun to targets (mirror, 2); NaN where they cannot."""
+    n, dish = len(model), bool(target[0, 3])
+    sun = np.broadcast_to(sun_enu, (n, 1, 3))
+    goal = sun if dish else target[:, None, :3]
+    rows = aim_rows(sun, goal, source_is_point=False, target_is_point=not dish)
+    count, status = mount_kernels.command_batch(model, constant, np.ascontiguousarray(rows))
+    return np.where(status != 0, np.nan, count[:, 0])
+
+
+def _counted(reasons: Mapping[int, str]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for why in reasons.values():
+        found[why] = found.get(why, 0) + 1
+    return found
