@@ -35,6 +35,9 @@ _METHODS = (
         "rfpose track site.toml -o year.h5 --heliostats 100 --days 12 --day-interval 30 --picture year.png",
         "rfpose track site.toml -o clouds.h5 --days 12 --day-interval 30 --sky bursts",
         "rfpose track site.toml -o field.h5 --heliostats 10000 --methods radio",
+        "rfpose track site.toml -o alarm.h5 --event '11.5 emergency' --event '12 release'",
+        "rfpose track site.toml -o lost.h5 --event '9.5 counts-lost H03' --event '9.6 zero-counts H03' "
+        "--event '10 calibrate H03'",
     ),
 )
 @click.argument("scenario", type=click.Path(path_type=Path))
@@ -47,6 +50,17 @@ _METHODS = (
 @click.option("--heliostats", type=int, help="How many mirrors; more than the scenario lists: spread over its field.")
 @click.option(
     "--sky", type=click.Choice(["clear", "bursts"]), help="Clear, or clouds and sun by turns; default: the scenario's."
+)
+@click.option(
+    "--event",
+    "events",
+    multiple=True,
+    metavar="'[DAY:]HOUR WHAT [WHO]'",
+    help="Something that happens, as in [[tracking.event]]: '11.5 emergency', '9 calibrate H01,H02', "
+    "'2:12 cluster-fails #0'. WHO: names, or # and the number of a cluster. May be repeated.",
+)
+@click.option(
+    "--without-field-control", is_flag=True, help="Track from the first second: no modes, messages and events."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
@@ -63,6 +77,8 @@ def command(
     day_interval: int | None,
     heliostats: int | None,
     sky: str | None,
+    events: tuple[str, ...],
+    without_field_control: bool,
     seed: int,
     csv_path: Path | None,
     picture: Path | None,
@@ -92,6 +108,8 @@ def command(
             day_interval=day_interval,
             heliostats=heliostats,
             sky=sky,
+            events=[_event(text) for text in events],
+            without_field_control=without_field_control,
             seed=seed,
             force=force,
             on_progress=on_progress,
@@ -128,9 +146,54 @@ def command(
                 f"  {name}: {sun['bursts']:.4g} times out of clouds, {1e3 * sun['response_loss']:.2g} ‰ of the light "
                 f"lost in the first {sun['response_window_s']:.0f} s, {1e3 * sun['turning_loss']:.2g} ‰ by turning"
             )
+        if "field_control" in summary["methods"][name]:
+            _say_field_control(name, summary["methods"][name])
         if summary["methods"][name]["out_of_reach"]:
             share = 100.0 * summary["methods"][name]["out_of_reach"]
             say(f"  {name}: {share:.2g} % of the time mirrors could not face their aim point")
+
+
+def _event(text: str) -> dict[str, Any]:
+    """Read an event of the command line into the keys of ``[[tracking.event]]``."""
+    words = text.split()
+    day, _, hour = words[0].rpartition(":") if words else ("", "", "")
+    try:
+        if not 2 <= len(words) <= 3:
+            raise ValueError
+        event: dict[str, Any] = {"hour": float(hour), "what": words[1]} | ({"day": int(day)} if day else {})
+        if len(words) == 3:
+            who = words[2]
+            event |= {"cluster": int(who[1:])} if who.startswith("#") else {"heliostats": tuple(who.split(","))}
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r} must be '[DAY:]HOUR WHAT [WHO]', such as '11.5 emergency', '9 calibrate H01,H02' or "
+            "'2:12 cluster-fails #0'",
+            param_hint="'--event'",
+        ) from None
+    return event
+
+
+def _say_field_control(name: str, found: dict[str, Any]) -> None:
+    """Print what field control has to tell of a method."""
+    away = {mode: value for mode, value in found["modes"].items() if mode not in ("point", "track")}
+    lost = sum(value["lost_kwh_per_m2"] for value in away.values())
+    if lost > 0.0:
+        worst = ", ".join(sorted(away, key=lambda mode: -away[mode]["lost_kwh_per_m2"])[:3])
+        say(f"  {name}: {lost:.3g} kWh/m² lost while mirrors were not on the receiver ({worst})")
+    for day in found["field_control"]:
+        for alarm in day["alarms"]:
+            times = [alarm["below_tenth_s"], alarm["off_s"], alarm["stowed_s"]]
+            below, off, stowed = ("–" if each is None else f"{each:.0f}" for each in times)
+            say(
+                f"  {name}, {day['day']}, {alarm['alarm']}: flux below a tenth after {below} s, last mirror off after "
+                f"{off} s, all stowed after {stowed} s"
+            )
+        for each in day["calibrations"]:
+            searched = " after a search" if each["searched"] else ""
+            say(f"  {name}, {day['day']}: {each['heliostat']} {each['outcome']}{searched}, {each['took_s']:.0f} s")
+        for event in day["events"]:
+            for why, count in event.get("refused", {}).items():
+                say(f"  {name}, {day['day']}, {event['hour']:g} h: {count} mirrors: {why}")
 
 
 def _row(name: str, found: dict[str, Any]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from rfpose.feedback.tracking import Simulation
 from rfpose.pipeline._checkpoint import Checkpoint
 from rfpose.pipeline.files import refuse_existing
 from rfpose.pipeline.track_file import Track, track_of, write_track
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import Scenario, check_scenario, load_scenario
 
 __all__ = ["track"]
 
@@ -27,6 +27,8 @@ def track(
     day_interval: int | None = None,
     heliostats: int | None = None,
     sky: str | None = None,
+    events: Sequence[Mapping[str, Any]] = (),
+    without_field_control: bool = False,
     seed: int = 0,
     force: bool = False,
     checkpoint_s: float = 20.0,
@@ -49,6 +51,10 @@ def track(
         How many mirrors; see `rfpose.feedback.tracking.hidden.field_positions`.
     sky
         ``clear`` or ``bursts``, instead of that in ``[tracking]``.
+    events
+        Happenings besides those of ``[[tracking.event]]``, with the same keys.
+    without_field_control
+        Track from the first second, without modes, messages and events.
     seed
         Same scenario and seed, same result.
     force
@@ -67,8 +73,11 @@ def track(
     """
     result_path = Path(result_path)
     refuse_existing(result_path, force=force)
-    scenario = _with(load_scenario(scenario_path), days=days, day_interval=day_interval, sky=sky)
+    base = load_scenario(scenario_path)
     try:
+        scenario = _with(
+            base, events, without_field_control, {"days": days, "day_interval": day_interval, "sky": sky}
+        )  # fmt: skip
         simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
     except (ScenarioError, GeometryError, InvalidInputError) as error:
         raise ScenarioError(f"{scenario_path}: {error}") from error
@@ -97,11 +106,18 @@ def track(
     return found
 
 
-def _with(scenario: Scenario, **changed: Any) -> Scenario:
-    """Return the scenario with some keys of ``[tracking]`` changed; None leaves one as it is."""
+def _with(
+    scenario: Scenario, events: Sequence[Mapping[str, Any]], without_field_control: bool, changed: Mapping[str, Any]
+) -> Scenario:
+    """Return the scenario with some keys of ``[tracking]`` changed, None leaving one as it is, and with more events."""
     values = {name: value for name, value in changed.items() if value is not None}
-    if not values:
-        return scenario
     data = scenario.model_dump(exclude_none=True)
-    data["tracking"] = {**data["tracking"], **values}
-    return Scenario.model_validate(data)
+    table = {**data["tracking"], **values}
+    if without_field_control:
+        if events:
+            raise ScenarioError("events need field control to act on; leave out one or the other")
+        table.pop("field_control", None)
+        table["event"] = ()
+    elif events:
+        table["event"] = [*table.get("event", ()), *events]
+    return check_scenario({**data, "tracking": table})

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import RecordingError, ScenarioError
+from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.pipeline.files import write_atomically
 from rfpose.scenario import Scenario, parse_scenario
@@ -33,7 +34,7 @@ __all__ = [
 ]
 
 FORMAT = "rfpose-tracking"
-VERSION = 1
+VERSION = 2
 
 _SERIES = {
     "rms_rad": ("rad", "time", "normal error over the field at that instant, rms"),
@@ -43,6 +44,9 @@ _SERIES = {
     "error_rad": ("rad", "time, stored", "angle between true and wanted normal"),
     "motor_count": ("steps", "time, stored, axis", "motor positions"),
     "shift_enu": ("rad", "time, stored, xyz", "what feedback adds to the normal that the model is asked for"),
+    "flux": ("1", "time", "light on the receiver over that of a perfect field on its aim"),
+    "mode_count": ("", "time, mode", "mirrors in each mode, numbered as under mode/name"),
+    "mode": ("", "time, stored", "modes of the stored mirrors"),
 }
 _SCORES = {
     "heliostat_rms_rad": ("rad", "heliostat", "normal error, rms over all days"),
@@ -53,6 +57,7 @@ _SCORES = {
     "day_rms_rad": ("rad", "day", "normal error by day"),
     "day_worst_heliostat_rad": ("rad", "day", "rms of the day's worst mirror"),
     "day_intercept": ("1", "day", "by day"),
+    "by_mode": ("s, J/m²", "mode, seconds-offered-caught", "time and light of a mirror in each mode, all days"),
 }
 _FIELD = {
     "heliostat/pivot_enu_m": ("m", "heliostat, xyz", "nominal pivots"),
@@ -74,11 +79,14 @@ class MethodTrack:
         Of the method.
     series
         ``rms_rad``, ``p95_rad``, ``worst_rad`` (time,); ``normal_enu`` (time, stored, xyz), ``error_rad`` (time,
-        stored), ``motor_count`` (time, stored, axis), ``shift_enu`` (time, stored, xyz).
+        stored), ``motor_count`` (time, stored, axis), ``shift_enu`` (time, stored, xyz), ``flux`` (time,),
+        ``mode_count`` (time, mode), ``mode`` (time, stored).
     scores
-        ``heliostat_…`` (heliostat,), ``hour_rms_rad`` (24,), ``day_…`` (day,).
+        ``heliostat_…`` (heliostat,), ``hour_rms_rad`` (24,), ``day_…`` (day,), ``by_mode`` (mode, 3).
     summary
         Plain values, as `Score.as_dict` gives them.
+    happened
+        Of each day under field control: ``events``, ``alarms``, ``calibrations``, ``messages``.
     """
 
     name: str
@@ -86,6 +94,7 @@ class MethodTrack:
     series: Mapping[str, npt.NDArray[Any]]
     scores: Mapping[str, npt.NDArray[Any]]
     summary: Mapping[str, Any]
+    happened: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +141,10 @@ class Track:
             "days": list(self.dates),
             "seed": int(self.settings["seed"]),
             "ranking": self.ranking(),
-            "methods": {name: dict(method.summary) for name, method in self.methods.items()},
+            "methods": {
+                name: dict(method.summary) | ({"field_control": list(method.happened)} if method.happened else {})
+                for name, method in self.methods.items()
+            },
         }
 
 
@@ -150,6 +162,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str]) -> Track:
             series={name: getattr(curves, name) for name in _SERIES},
             scores={name: getattr(found, name) for name in _SCORES},
             summary=_plain(found),
+            happened=tuple(simulation.happened(method.name)),
         )
     return Track(
         scenario=simulation.scenario,
@@ -198,6 +211,7 @@ def write_track(track: Track, path: str | Path) -> None:
             settings.attrs[name] = text
         _texts(file, "heliostat/id", track.heliostat_ids)
         _texts(file, "day/date", track.dates)
+        _texts(file, "mode/name", tuple(mode.name.lower() for mode in Mode))
         for place, name in (
             ("heliostat/pivot_enu_m", "pivot_enu_m"),
             ("heliostat/target_enu_m", "target_enu_m"),
@@ -212,6 +226,7 @@ def write_track(track: Track, path: str | Path) -> None:
             group = file.create_group(f"method/{method.name}")
             group.attrs["text"] = method.text
             group.attrs["summary"] = json.dumps(method.summary)
+            group.create_dataset("happened", data=json.dumps(method.happened))
             for name, key in _SERIES.items():
                 _write(group, name, method.series[name], key)
             for name, key in _SCORES.items():
@@ -274,6 +289,7 @@ def _read(file: h5py.File, path: Path) -> Track:
             series={key: read_only(group[key][()]) for key in _SERIES},
             scores={key: read_only(group[f"score/{key}"][()]) for key in _SCORES},
             summary=json.loads(group.attrs["summary"]),
+            happened=tuple(json.loads(group["happened"].asstr()[()])),
         )
     return Track(
         scenario=parse_scenario(file["scenario"].asstr()[()], source=f"{path}, scenario"),

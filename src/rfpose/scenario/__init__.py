@@ -6,7 +6,7 @@ contradictions. Every length is metres in the site ENU frame unless a name says 
 
 from __future__ import annotations
 
-from rfpose.scenario._reading import load_scenario, parse_scenario
+from rfpose.scenario._reading import check_scenario, load_scenario, parse_scenario
 from rfpose.scenario._scenario import Receiver, Scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
@@ -46,6 +46,7 @@ __all__ = [
     "Site",
     "Tone",
     "Transmitter",
+    "check_scenario",
     "load_scenario",
     "parse_scenario",
 ]

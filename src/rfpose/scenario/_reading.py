@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,20 @@ def parse_scenario(text: str, *, source: str = "scenario", scale: float | None =
         raise ScenarioError(f"{source}: {_in_words(error)}") from error
     except ScenarioError as error:
         raise ScenarioError(f"{source}: {error}") from error
+
+
+def check_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Return a scenario from plain values, as `Scenario.model_dump` gives them and somebody has changed them.
+
+    Raises
+    ------
+    ScenarioError
+        They contradict themselves; in the same words as for a file.
+    """
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(_in_words(error)) from error
 
 
 def _fill_heliostats(data: dict[str, Any]) -> None:

@@ -384,7 +384,8 @@ class FieldControl:
                 "alarms": self._alarms,
                 "rng": self._wire.rng.bit_generator.state,
                 "times_s": [self._time_s, self._wind_known_s, self._wind_calm_s, self._centre_lost_s],
-            }
+            },
+            default=lambda words: [int(word) for word in words],  # some generators keep their state in arrays
         )
         out["centre"] = np.frombuffer(text.encode(), np.uint8).copy()
         return out
@@ -406,7 +407,7 @@ class FieldControl:
             setattr(owner, name, value if value.ndim else value.item())
         centre = json.loads(bytes(state["centre"]).decode())
         self._alarms = centre["alarms"]
-        self._wire.rng.bit_generator.state = centre["rng"]
+        self._wire.rng.bit_generator.state = _with_arrays(centre["rng"])
         self._time_s, self._wind_known_s, self._wind_calm_s, self._centre_lost_s = centre["times_s"]
         self._heliostats.forget_derived()
 
@@ -510,6 +511,13 @@ def _flags(value: npt.ArrayLike, n: int) -> BoolArray:
     """Return one flag a heliostat."""
     flags = np.asarray(value, np.bool_)
     return flags if flags.shape == (n,) else np.broadcast_to(flags, (n,))
+
+
+def _with_arrays(state: Any) -> Any:
+    """Give a generator's state back the arrays that JSON made lists of."""
+    if isinstance(state, dict):
+        return {name: _with_arrays(value) for name, value in state.items()}
+    return np.array(state, np.uint64) if isinstance(state, list) else state
 
 
 def _level_right(way_m: FloatArray) -> FloatArray:
