@@ -223,6 +223,45 @@ def test_sun_near_its_limit_is_not_quiet():
     assert control.alarms == ("sun below the horizon",)
 
 
+def test_forged_messages_are_not_quiet_until_they_are_heard():
+    control, inputs = _calm(n=3200, bit_error_rate=2e-3, settings=FieldSettings(watchdog_intervals=50.0))
+    control.step(0.0, **inputs)
+    control.step(1.0, **inputs)
+    before = control.messages
+    control.step(4.0, **inputs)
+    assert control.messages.question_undetected > before.question_undetected
+    assert not np.any(control.mode != Mode.TRACK)
+    assert control.quiet_until(8.0) == 4.0
+    control.step(5.0, **inputs)
+    assert control.quiet_until(8.0) == 8.0
+
+
+def test_ends_of_the_centres_clocks_are_stepped_to():
+    settings = FieldSettings(wind_release_s=30.0, wind_gap_s=20.0, centre_silence_s=10.0)
+    control, inputs = _calm(mode=Mode.STOW, settings=settings)
+
+    def until(now, **changes):
+        control.step(now, **inputs, **changes)
+        return control.quiet_until(now + 4.0)
+
+    for now in (0.0, 1.0):
+        until(now, wind_m_s=10.0)
+    assert control.alarms == ("strong wind",)
+    until(4.0, wind_m_s=10.0)  # stow is ordered
+    until(8.0, wind_m_s=10.0)
+    assert [until(now, wind_m_s=7.0) - now for now in (28.0, 32.0, 36.0)] == [4.0, 4.0, 0.0]
+    assert until(38.0, wind_m_s=7.0) == 40.0  # the next round
+    assert control.alarms == ()
+    assert [until(now, wind_m_s=np.nan) - now for now in (52.0, 56.0)] == [4.0, 0.0]
+    control.step(56.0, **inputs)
+    control.fail_centre()
+    assert [until(now, wind_m_s=20.0) - now for now in (60.0, 64.0)] == [4.0, 0.0]
+    control.repair_centre()
+    assert control.quiet_until(65.0) == 64.0  # the first look at the wind is to come
+    until(64.0, wind_m_s=20.0)
+    assert control.alarms == ("strong wind",)
+
+
 def test_an_order_that_cannot_arrive_does_not_keep_the_field_awake():
     control, inputs = _calm(n=64, mode=Mode.STOW)
     control.fail_cluster(0)
@@ -234,13 +273,14 @@ def test_an_order_that_cannot_arrive_does_not_keep_the_field_awake():
     assert control.quiet_until(4.0) == 4.0  # the third waits for the next round
     control.step(4.0, **inputs)
     assert control.quiet_until(8.0) == 4.0
-    control.step(5.0, **inputs)
+    for second in (5.0, 6.0, 7.0):  # it is on its aim already: at once on its way, there, and tracking
+        control.step(second, **inputs)
     assert np.flatnonzero(control.mode == Mode.TRACK).tolist() == [50]
-    control.power_off([50])
-    control.step(6.0, **inputs)
-    control.step(7.0, **inputs)
     assert np.flatnonzero(control.waiting).tolist() == [3, 40]
-    for now, until in ((7.0, 8.0), (8.0, 12.0)):
+    control.command(Event.STOW, [50])
+    for second in np.arange(8.0, 28.0):  # longer than the watchdog waits: to stowed heliostats silence does nothing
+        control.step(second, **(inputs | {"axis_rad": np.zeros((64, 2))}))
+    for now, until in ((27.5, 28.0), (28.0, 32.0)):
         control.step(now, **inputs)
         assert control.quiet_until(until) == until
 

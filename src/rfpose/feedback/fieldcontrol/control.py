@@ -313,10 +313,12 @@ class FieldControl:
         Stepping once, from the present time straight to any time up to the one returned, leaves the same `state`
         as stepping there through times between, random numbers included, but for ``wire.reported_axis_rad``: a
         report holds the axes of the step that took it up, so it differs where axes move, which those that follow
-        their aim do. The orders of the last step stand meanwhile. This holds while, up to that time,
+        their aim do. The orders of the last step stand meanwhile. Messages that arrive meanwhile are taken up in the
+        step there: whoever steers by `Orders.sun_enu` steps once more within the interval, when the round is over, or
+        steers by a sun that is one round older. This holds while, up to that time,
 
-        - wind and feedback stay as given in the last step; feedback may change in the step there itself. Wind may vary
-          below ``wind_stow_m_s`` while there is no wind alarm: only the time in the state when it was last above
+        - wind and feedback stay as given in the last step; feedback may change in the step there itself. Known wind may
+          vary below ``wind_stow_m_s`` while there is no wind alarm: only the time in the state when it was last above
           ``wind_release_m_s`` differs then, which the next strong wind sets anew;
         - the sun moves no faster than the sky turns;
         - nobody calls `command`, `emergency`, `fail_cluster` or another method that changes something.
@@ -335,8 +337,8 @@ class FieldControl:
 
             - before the first step, and after a step in which a mode changed;
             - with heliostats on their way to stow or to an aim, searching, or in an emergency;
-            - with an urgent order on the wire, or a question or answer to a heliostat for which an order waits, or
-              a message with wrong bits that the checksum missed. An order that waits for the next round is quiet;
+            - with an urgent order on the wire, a question to a heliostat for which an order waits, or a message with
+              wrong bits that the checksum missed. An order that waits for the next round is quiet;
             - where a watchdog, the centre's silence, unknown wind or the end of a wind alarm would be due;
             - whose sun is so near to ``sun_lowest_rad`` that it may cross it.
 
@@ -504,7 +506,7 @@ class FieldControl:
         # the sun as last sent out, which has moved since and will: twice that way, and a packet's last digit
         above = self._wire.round_sun_enu[2] - self._lowest_sine
         margin = _SUN_MARGIN_RAD + 2.0 * EARTH_RAD_S * (until_s - self._wire.round_s)
-        return bool(abs(above) > margin and (above < 0.0) == (_NIGHT in alarms))
+        return bool(abs(above) > margin)
 
 
 def _flags(value: npt.ArrayLike, n: int) -> BoolArray:

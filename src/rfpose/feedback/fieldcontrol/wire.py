@@ -147,9 +147,9 @@ class Wire:
         forged = self.fate == int(MessageStatus.UNDETECTED)
         if forged.any() and (forged & (self.arrival_s[:2] <= until_s)).any():
             return False
-        # an order waits for its question, and is done with by the answer
-        waits = self.pending != NOTHING
-        return not (waits.any() and (waits & (self.arrival_s[1:] <= until_s)).any())
+        # an order waits for its question; with a dead cluster's controller it may wait for long
+        waits = (self.pending != NOTHING) & ~self.done
+        return not (waits.any() and (waits & (self.arrival_s[1] <= until_s)).any())
 
     def _begin_round(self, start_s: float, sun_enu: FloatArray) -> None:
         """Draw a round; what of the last one is still on its way is out of date and dropped."""

@@ -32,6 +32,10 @@ N_RING, N_ENTRY = 16, 6
 LOST, USED, HEARD = 0.0, 1.0, 2.0
 """Heard: received while the mirror was about something else; neither steered by nor learnt from."""
 
+N_SCRATCH = 112
+N_BLOCK = 64
+"""Mirrors are shared out in so many parts, each with room of its own to work in."""
+
 # what is added up over a day
 (
     STEPS, SQUARE, WORST, BEAM_SQUARE, BEAM_WORST, ENERGY, CAUGHT, MOTOR_1, MOTOR_2, STARTS, OUT_OF_REACH,
@@ -76,6 +80,8 @@ class Loop(NamedTuple):
     pole_n: float
     pole_u: float
     """The celestial pole, north and up."""
+    control: int
+    """Servo steps from one word of field control to the next."""
     turn: float
     """How far a mirror carries on a sun that it heard of, in a servo step [rad]; 0: it does not."""
     swings: bool
@@ -260,31 +266,25 @@ def _track(
     step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
     p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
     bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, hours, hour_of, histogram,
-    stride, trace_error, trace_light, trace, keeps, light,
+    stride, trace_error, trace_light, trace, keeps, light, scratch,
 ):  # fmt: skip
     """One mirror through a stretch of steps; see `advance`."""
-    prepared = np.empty(16)
-    known = np.empty(16)
-    work = np.empty((3, 6))
-    true = np.empty(6)
-    guess = np.ones(6)
-    wanted = np.empty(3)
-    hoped = np.empty(3)
-    error = np.empty(3)
-    across = np.empty(2)
-    counts = np.empty(2)
-    change = np.empty(3)
-    seen = np.empty(3)
-    row = np.zeros(10)
+    prepared, known, guess, true = scratch[0:16], scratch[16:32], scratch[32:38], scratch[38:44]
+    wanted, hoped, error, change = scratch[44:47], scratch[47:50], scratch[50:53], scratch[53:56]
+    seen, across, counts = scratch[56:59], scratch[59:61], scratch[61:63]
+    row, receiver, aside = scratch[64:74], scratch[74:84], scratch[84:94]
+    work = scratch[94:112].reshape(3, 6)
+    guess[:] = 1.0
+    row[:] = 0.0
+    aside[:] = 0.0
     is_dish = target[3] > 0.5
     row[4:7] = aim
     row[7] = 0.0 if is_dish else 1.0
     row[8] = 1.0
     row[9] = target[3]
-    receiver = row.copy()
+    receiver[:] = row
     receiver[4:7] = target[:3]
-    aside = np.zeros(10)  # a row whose light comes from and goes to one direction
-    aside[8] = 1.0
+    aside[8] = 1.0  # a row whose light comes from and goes to one direction
     lean_north, lean_east = p[0], p[1]
     plate_up, plate_right = p[29], p[30]
     _prepare(model, k, known)
@@ -306,18 +306,19 @@ def _track(
             fresh = state[STARTED] == 0.0
             reached = True
             ahead = loop.interval - g % loop.interval
+            word = g // loop.control - (step0 + first) // loop.control
             if fresh or (renew and s == first):
                 seen[:] = sun[s]
-                if age >= 0.0:
-                    _carried(heard, loop.turn * (age + s - first), loop, seen)
+                if math.isfinite(age[word]):
+                    _carried(heard[word], loop.turn * (age[word] + s - first), loop, seen)
                 reached = _command(model, k, known, row, seen, counts, work)
                 if reached:
                     _nearest_turn(state[NEXT], k, counts)
                     state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
             seen[:] = sun[s + ahead]
-            if age >= 0.0:
-                _carried(heard, loop.turn * (age + s - first + ahead), loop, seen)
+            if math.isfinite(age[word]):
+                _carried(heard[word], loop.turn * (age[word] + s - first + ahead), loop, seen)
             reached = _command(model, k, known, row, seen, counts, work) and reached
             shift = state[SHIFT : SHIFT + 3]
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
@@ -573,8 +574,8 @@ def advance(
     axis is the mirror; step ``s`` of the stretch is step ``step0 + s`` of the day. ``table`` of captures.
 
     What mirrors are told: ``duty``; ``renew``: at the first step it or the aim is another than before; ``scored``: on
-    the receiver; ``mode`` row of ``by_mode``; ``aim`` (xyz); ``goal`` (2) counts; ``heard`` (xyz) sun, so many steps
-    ``age`` before the first step; negative: the sun is known.
+    the receiver; ``mode`` row of ``by_mode``; ``aim`` (xyz); ``goal`` (2) counts; ``heard`` (interval, xyz) sun, so
+    many steps ``age`` (interval) before the first step; NaN: the sun is known.
 
     ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model`` what the controller
     believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz); ``target`` (xyz, 1 for
@@ -584,13 +585,17 @@ def advance(
     ``trace_light`` (trace, 2); ``stored`` row of ``trace`` or −1; ``trace`` (stored, trace, 8); ``light`` (2) caught
     and offered, as parts of the beam, at the last step.
     """
-    for h in nb.prange(p.shape[0]):
-        keeps = stored[h] >= 0
-        _track(
-            loop, law, drive_1, drive_2, table,
-            step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
-            p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
-            mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-            sensor[h], state[h], ring[h], total[h], by_mode[h], hours[h], hour_of, histogram[h], stride,
-            trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h],
-        )  # fmt: skip
+    n = p.shape[0]
+    share = max(n // N_BLOCK, 1)
+    for block in nb.prange((n + share - 1) // share):
+        scratch = np.empty(N_SCRATCH)
+        for h in range(block * share, min((block + 1) * share, n)):
+            keeps = stored[h] >= 0
+            _track(
+                loop, law, drive_1, drive_2, table,
+                step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
+                p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
+                mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
+                sensor[h], state[h], ring[h], total[h], by_mode[h], hours[h], hour_of, histogram[h], stride,
+                trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
+            )  # fmt: skip

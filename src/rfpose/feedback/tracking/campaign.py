@@ -58,6 +58,11 @@ class Campaign:
         self.results: list[dict[str, Any]] = []
         self.found = np.zeros(len(field), np.bool_)
 
+    @property
+    def active(self) -> bool:
+        """Whether mirrors are at the target or wait for it."""
+        return bool(self._waiting) or self._there is not None
+
     def queue(self, index: npt.NDArray[np.int64]) -> None:
         """Let mirrors take turns, after those that wait already."""
         self._waiting += [i for i in index.tolist() if i not in self._waiting]

@@ -36,6 +36,8 @@ __all__ = ["Operation", "Told", "who_of"]
 _LATE_INTERVALS = 1.5
 """From a round to the middle of the interval in which its sun is used."""
 _SILENT_FRAMES = 5.0
+_WORDS_AHEAD = 4
+"""Control intervals that are told at once while nothing happens; so much later may a mode show that radio is lost."""
 _COMMANDS = {
     "stow": Event.STOW,
     "approach": Event.APPROACH,
@@ -53,8 +55,9 @@ _BACK = (Mode.STOW, Mode.STOWING, Mode.POWER_LOSS, Mode.FAULT)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Told:
-    """What mirrors are told until the next word; see `_kernels.advance`."""
+    """What mirrors are told until step ``until`` of the day; see `_kernels.advance`."""
 
+    until: int
     duty: npt.NDArray[np.int64]
     renew: npt.NDArray[np.uint8]
     scored: npt.NDArray[np.uint8]
@@ -69,14 +72,15 @@ class Told:
         """Return what mirrors do without field control: track their aim, by a sun that is known."""
         n = len(field)
         return cls(
+            until=0,
             duty=np.full(n, _kernels.TRACK),
             renew=np.zeros(n, np.uint8),
             scored=np.ones(n, np.uint8),
             mode=np.full(n, int(Mode.TRACK)),
             aim=field.target[:, :3].copy(),
             goal=np.zeros((n, 2)),
-            heard=np.zeros((n, 3)),
-            age=np.full(n, np.nan),
+            heard=np.zeros((n, 1, 3)),
+            age=np.full((n, 1), np.nan),
         )
 
 
@@ -129,6 +133,7 @@ class Operation:
         self._last_duty = np.full(n, -1, np.int64)
         self._last_aim = np.full((n, 3), np.nan)
         self._last_mode = self.control.mode
+        self._ahead: Orders | None = None
         self.log: list[dict[str, Any]] = []
         self.homing_rad = np.zeros((n, 2))
 
@@ -147,15 +152,18 @@ class Operation:
     # -- going on ------------------------------------------------------------------------------------------
 
     def tell(
-        self, s: int, *, first_of: int, state: FloatArray, model: FloatArray, true: FloatArray, light: FloatArray,
-        gust: npt.NDArray[np.float32],
+        self, s: int, span: tuple[int, int], *, state: FloatArray, model: FloatArray, true: FloatArray,
+        light: FloatArray, gust: npt.NDArray[np.float32],
     ) -> Told:  # fmt: skip
         """Let messages pass until step ``s`` of the day and return what the mirrors are told from there on.
 
+        For a second; for the rest of the control interval if all is quiet; for some intervals if it stays so.
+
         Parameters
         ----------
-        s, first_of
-            The step, and the first one of its stretch, with which ``gust`` begins.
+        s, span
+            The step; first step and end of its stretch of the day, with which ``gust`` begins and beyond which nothing
+            is told.
         state, model
             Of the method's mirrors, as the kernels have them; a calibration changes the model, a homing the counts.
         true : (mirror, 34)
@@ -165,31 +173,55 @@ class Operation:
         gust : (mirror, step)
             Of the stretch [m/s].
         """
-        now = s * self._servo_s
-        axis = self._home + state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / self._per_rad
-        self._let_happen(s, now, light)
-        self._programme(s)
-        self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, true)
-        orders = self.control.step(
-            now,
-            axis_rad=axis,
-            aim_axis_rad=self._aim_axis_rad(s, state, model),
-            sun_enu=self._day.sun_enu[s],
-            wind_m_s=self._wind_mps.at(s, first_of, gust),
-            feedback_valid=self._valid(state),
-            found=self.campaign.found,
-        )
-        self._home_counts(orders.mode, state, s)
-        self.watch.observe(now, orders.mode, light, orders.alarms)
-        return self._told(orders, state)
 
-    def until(self, s: int, end: int) -> int:
-        """Return the step up to which what was told at step ``s`` holds: a second, or a control interval in quiet."""
+        def step(at: int) -> Orders:
+            return self.control.step(
+                at * self._servo_s,
+                axis_rad=axis,
+                aim_axis_rad=aim_axis,
+                sun_enu=self._day.sun_enu[at],
+                wind_m_s=self._wind_mps.at(at, span[0], gust),
+                feedback_valid=self._valid(state),
+                found=self.campaign.found,
+            )
+
+        axis = self._home + state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / self._per_rad
+        aim_axis = np.full(axis.shape, np.nan)
+        orders, self._ahead = self._ahead, None
+        if orders is None:
+            self._let_happen(s, light)
+            self._programme(s)
+            self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, true)
+            aim_axis = self._aim_axis_rad(s, state, model)
+            orders = step(s)
+        self._home_counts(orders.mode, state, s)
+        self.watch.observe(s * self._servo_s, orders.mode, light, orders.alarms)
+        words = [orders]
+        until = self._holds_until(s)
+        while len(words) < _WORDS_AHEAD and until < span[1] and self._calm(until):
+            later = step(until)
+            if later.changed.any() or later.alarms != orders.alarms:
+                self._ahead = later
+                break
+            words.append(later)
+            until = self._holds_until(until)
+        return self._told(words, s, min(until, span[1]), state)
+
+    def _calm(self, s: int) -> bool:
+        """Whether nothing but messages goes on at the control interval that begins at step ``s``."""
+        waits = self.campaign.active or self.watch.open or self._due(s) or s > self._works_until
+        return s % self._interval == 0 and not waits
+
+    def _due(self, s: int) -> bool:
+        return self._next_event < len(self._events) and self._events[self._next_event][0] <= s
+
+    def _holds_until(self, s: int) -> int:
+        """Return the step up to which a word holds: a second, or the rest of a control interval in quiet."""
         tick = (s // self._interval + 1) * self._interval
         if self._next_event < len(self._events):
             tick = min(tick, max(self._events[self._next_event][0], s + 1))
         quiet = self.control.quiet_until(tick * self._servo_s) >= tick * self._servo_s
-        return min(tick if quiet and not self.watch.open else s + 1, end)
+        return tick if quiet and not self.watch.open else s + 1
 
     def end(self) -> None:
         """Close what is under way at the end of the day."""
@@ -204,7 +236,8 @@ class Operation:
             "messages": self.control.messages.as_dict(),
         }
 
-    def _told(self, orders: Orders, state: FloatArray) -> Told:
+    def _told(self, words: list[Orders], s: int, until: int, state: FloatArray) -> Told:
+        orders = words[0]
         mode = orders.mode.astype(np.int64)
         follows = _FOLLOWS[mode] & np.isfinite(orders.sun_enu).all(axis=1)
         duty = np.where(follows, np.where(mode == Mode.POINT, _kernels.FOLLOW, _kernels.TRACK), _kernels.GO)
@@ -215,16 +248,19 @@ class Operation:
         renew = follows & ((self._last_duty == _kernels.GO) | (aim != self._last_aim).any(axis=1))
         self._last_duty, self._last_aim = duty, aim
         late_s = _LATE_INTERVALS * self._interval * self._servo_s if self._held else 0.0
-        age = np.maximum((orders.sun_age_s - late_s) / self._servo_s, 0.0)
+        since = np.array([word.time_s / self._servo_s - s for word in words])
+        age = np.stack([(word.sun_age_s - late_s) / self._servo_s for word in words], axis=1) - since
+        heard = np.stack([word.sun_enu for word in words], axis=1)
         return Told(
+            until=until,
             duty=duty,
             renew=renew.astype(np.uint8),
             scored=(_ON_RECEIVER[mode] & follows).astype(np.uint8),
             mode=mode,
             aim=aim,
             goal=goal,
-            heard=np.where(follows[:, None], orders.sun_enu, 0.0),
-            age=np.where(follows, age, 0.0),
+            heard=np.where(follows[:, None, None], heard, 0.0),
+            age=np.where(follows[:, None], age, 0.0),
         )
 
     def _valid(self, state: FloatArray) -> npt.NDArray[np.bool_]:
@@ -264,8 +300,8 @@ class Operation:
         if to.any():
             self.control.command(command, to)
 
-    def _let_happen(self, s: int, now_s: float, light: FloatArray) -> None:
-        while self._next_event < len(self._events) and self._events[self._next_event][0] <= s:
+    def _let_happen(self, s: int, light: FloatArray) -> None:
+        while self._due(s):
             _, event, who = self._events[self._next_event]
             self._next_event += 1
             entry: dict[str, Any] = {"what": event.what, "hour": event.hour, "heliostats": int(who.sum())}
@@ -273,7 +309,7 @@ class Operation:
             if reasons:
                 entry["refused"] = reasons
             if event.what == "emergency":
-                self.watch.begin(now_s, "emergency", light)
+                self.watch.begin(s * self._servo_s, "emergency", light)
             self.log.append(entry)
 
     def _do(self, event: Happening, who: npt.NDArray[np.bool_]) -> dict[str, int]:

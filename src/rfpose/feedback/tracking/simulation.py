@@ -300,6 +300,7 @@ class Simulation:
             reach=1e-3 * plan.sun_sensor.range_mrad,
             # an error of the normal moves a heliostat's image by twice itself, a dish's by once: so the tables have it
             per_rad=(N_CAPTURE - 1) / TOP_RAD,
+            control=control,
             **self._sky(),
             **self._structure(),
         )
@@ -441,15 +442,14 @@ class Simulation:
             if run.operation is not None:
                 _home(true, field.at(day.since_first), run.operation)
                 told = run.operation.tell(
-                    segment.first + s, first_of=segment.first, state=run.state, model=run.model, true=true,
+                    segment.first + s, (segment.first, segment.end), state=run.state, model=run.model, true=true,
                     light=run.light, gust=draws.gust,
                 )  # fmt: skip
-                end = run.operation.until(segment.first + s, segment.end) - segment.first
+                end = told.until - segment.first
                 _home(true, field.at(day.since_first), run.operation)
-            if run.operation is None or s % self._stride == 0:
-                at = slice(segment.first_stored + s // self._stride, segment.first_stored + -(-end // self._stride))
-                run.mode_count[at] = np.bincount(told.mode, minlength=len(Mode))
-                run.mode[at] = told.mode[self.stored]
+            at = slice(*(segment.first_stored - (-each // self._stride) for each in (s, end)))
+            run.mode_count[at] = np.bincount(told.mode, minlength=len(Mode))
+            run.mode[at] = told.mode[self.stored]
             _kernels.advance(
                 run.loop, run.law, *drives, self._table,
                 segment.first, s, end, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
