@@ -306,7 +306,7 @@ def _track(
             fresh = state[STARTED] == 0.0
             reached = True
             ahead = loop.interval - g % loop.interval
-            word = g // loop.control - (step0 + first) // loop.control
+            word = min(g // loop.control - (step0 + first) // loop.control, len(age) - 1)
             if fresh or (renew and s == first):
                 seen[:] = sun[s]
                 if math.isfinite(age[word]):

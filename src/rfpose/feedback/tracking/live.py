@@ -15,10 +15,11 @@ from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.instruments import Workshop
-from rfpose.feedback.tracking.loops import check_gains
+from rfpose.feedback.tracking.loops import check_gains, drive_numbers
 from rfpose.feedback.tracking.methods import METHODS
 from rfpose.feedback.tracking.operation import Told
 from rfpose.feedback.tracking.radio import RadioErrors, RadioModel
+from rfpose.feedback.tracking.run import MethodRun
 from rfpose.feedback.tracking.simulation import Simulation
 from rfpose.scenario import Scenario
 
@@ -141,7 +142,7 @@ class LiveField:
         count = min(MOST_MIRRORS, len(scenario.heliostat)) or None
         check_gains(scenario)
         self._plan = Simulation(scenario, methods=("open-loop",), count=count, seed=seed)
-        self._run = self._plan._start(METHODS["radio"])
+        self._run = MethodRun(METHODS["radio"], self._plan.world)
         self.field, self._day = self._plan.field, self._plan.days[0]
         self._scenario, self._seed = scenario, int(seed)
         self._servo_s = scenario.tracking.servo_interval_s
@@ -270,7 +271,7 @@ class LiveField:
         return self._radio.errors(self._wanted_enu(self._at), generator(self._seed, 13, self._at))
 
     def _wanted_enu(self, i_step: int) -> FloatArray:
-        return self._plan._wanted_normal(self._day, i_step)
+        return self._plan.wanted_normal_enu(self._day, i_step)
 
     def _nearest_count(self) -> FloatArray:
         """Azimuth motors' counts towards the first wanted normals, nearest to the middle of their travel."""
@@ -325,7 +326,7 @@ class LiveField:
         n_free = run.cov.shape[1]
         rng = generator(self._seed, 16, steps.start)
         _kernels.advance(
-            run.loop, run.law, self._plan._drive(0), self._plan._drive(1), self._plan._table,
+            run.loop, run.law, *(drive_numbers(self._scenario, axis) for axis in (0, 1)), self._plan.world.table,
             steps.start, *span, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
             told.age, field.at(0.0), field.constant, field.lean_rad, day.heat[steps].copy(), run.model,
             np.zeros((n, n_free, n_free)), np.zeros(n_free, np.int64), np.zeros(n_free), np.zeros(n_free),

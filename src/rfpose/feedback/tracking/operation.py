@@ -31,7 +31,7 @@ from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Event as Happening
 
-__all__ = ["Operation", "Told", "who_of"]
+__all__ = ["Operation", "Told", "aim_count", "who_of"]
 
 _LATE_INTERVALS = 1.5
 """From a round to the middle of the interval in which its sun is used."""
@@ -275,7 +275,7 @@ class Operation:
         axis = np.full((len(state), 2), np.nan)
         index = np.flatnonzero(self.control.mode == Mode.APPROACH)
         if index.size:
-            count = aim_count(
+            count, _ = aim_count(
                 model[index], self._field.constant[index], self._day.sun_enu[s], self._field.target[index]
             )
             turn = 2.0 * np.pi * self._per_rad[index, 0]
@@ -474,14 +474,19 @@ def _agenda(
     return sorted(found, key=lambda each: each[0])
 
 
-def aim_count(model: FloatArray, constant: FloatArray, sun_enu: FloatArray, target: FloatArray) -> FloatArray:
-    """Return motor counts at which models send the sun to targets (mirror, 2); NaN where they cannot."""
+def aim_count(
+    model: FloatArray, constant: FloatArray, sun_enu: FloatArray, target: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.int8]]:
+    """Return motor counts at which models send the sun to targets (mirror, 2), NaN where they cannot, and why.
+
+    The status is 0 if they can, 1 where there is no posture, 2 beyond the limits.
+    """
     n, dish = len(model), bool(target[0, 3])
     sun = np.broadcast_to(sun_enu, (n, 1, 3))
     goal = sun if dish else target[:, None, :3]
     rows = aim_rows(sun, goal, source_is_point=False, target_is_point=not dish)
     count, status = mount_kernels.command_batch(model, constant, np.ascontiguousarray(rows))
-    return np.where(status != 0, np.nan, count[:, 0])
+    return np.where(status != 0, np.nan, count[:, 0]), status[:, 0]
 
 
 def _counted(reasons: Mapping[int, str]) -> dict[str, int]:

@@ -12,7 +12,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.energy import Bursts, response_loss
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels as kernels
-from rfpose.feedback.tracking.simulation import Sums
+from rfpose.feedback.tracking.run import Sums
 
 __all__ = ["Score", "score"]
 
