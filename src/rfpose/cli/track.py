@@ -134,12 +134,12 @@ def command(
     say("  rms, 95 % and worst of all mirrors and seconds; rms of the worst mirror; part of a perfect tracker's light")
     say("  caught, light caught by a square metre of mirror; motor steps a mirror and day")
     for name in summary["ranking"]:
-        outage = summary["methods"][name]["outage"]
-        if outage["rms_mrad"] is not None and name.startswith("radio"):
-            say(
-                f"  {name}: {outage['rms_mrad']:.3g} mrad while radio was out, "
-                f"{outage['loss_kwh_per_m2']:.3g} kWh/m² lost by it"
-            )
+        for i, outage in enumerate(summary["methods"][name]["outages"] if name.startswith("radio") else (), start=1):
+            if outage["rms_mrad"] is not None:
+                say(
+                    f"  {name}: {outage['rms_mrad']:.3g} mrad in outage {i} of the radio, "
+                    f"{outage['loss_kwh_per_m2']:.3g} kWh/m² lost by it"
+                )
         sun = summary["methods"][name]["sunshine"]
         if sun["response_loss"] is not None:
             say(

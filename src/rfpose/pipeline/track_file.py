@@ -36,6 +36,7 @@ __all__ = [
 FORMAT = "rfpose-tracking"
 VERSION = 2
 
+_SEASONS = {"Dec-Feb": (12, 1, 2), "Mar-May": (3, 4, 5), "Jun-Aug": (6, 7, 8), "Sep-Nov": (9, 10, 11)}
 _SERIES = {
     "rms_rad": ("rad", "time", "normal error over the field at that instant, rms"),
     "p95_rad": ("rad", "time", "the same, 95 %"),
@@ -161,7 +162,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str]) -> Track:
             text=method.text,
             series={name: getattr(curves, name) for name in _SERIES},
             scores={name: getattr(found, name) for name in _SCORES},
-            summary=_plain(found),
+            summary=_plain(found.as_dict() | _over_the_year(simulation, found)),
             happened=tuple(simulation.happened(method.name)),
         )
     return Track(
@@ -179,7 +180,23 @@ def track_of(simulation: Simulation, settings: Mapping[str, str]) -> Track:
     )
 
 
-def _plain(found: Score) -> dict[str, Any]:
+def _over_the_year(simulation: Simulation, found: Score) -> dict[str, Any]:
+    """Return errors by season, and what days that stand for a year make of one: light caught and lost [kWh/m²]."""
+    plan = simulation.scenario.tracking
+    month = np.array([day.date.month for day in simulation.days])
+    seasons = {}
+    for name, months in _SEASONS.items():
+        squares = found.day_rms_rad[np.isin(month, months)] ** 2
+        if np.isfinite(squares).any():
+            seasons[name] = 1e3 * float(np.sqrt(np.nanmean(squares)))
+    year = None
+    if plan.days > 1 and 330 <= plan.days * plan.day_interval <= 400:
+        _, offered, caught = found.by_mode.sum(axis=0) / plan.days * 365.25 / 3.6e6
+        year = {"caught_kwh_per_m2": caught, "lost_kwh_per_m2": offered - caught}
+    return {"season_rms_mrad": seasons, "year": year}
+
+
+def _plain(found: Mapping[str, Any]) -> dict[str, Any]:
     """Give lists instead of arrays, None instead of NaN: as JSON would give them back."""
 
     def plain(value: Any) -> Any:
@@ -187,9 +204,9 @@ def _plain(found: Score) -> dict[str, Any]:
             return {key: plain(item) for key, item in value.items()}
         if isinstance(value, np.ndarray):
             return [plain(item) for item in value.tolist()]
-        return value if np.isfinite(value) else None
+        return None if value is None or not np.isfinite(value) else value
 
-    result: dict[str, Any] = plain(found.as_dict())
+    result: dict[str, Any] = plain(found)
     return result
 
 

@@ -118,7 +118,7 @@ class RadioFeedback(Record):
     lost_frames: Share = 0.1
     hidden_transmitters: Share = 0.0
     """Part of the pairs of mirror and transmitter that are without line of sight, drawn anew every 15 minutes."""
-    outages: tuple[Outage, ...] = ()
+    outages: Annotated[tuple[Outage, ...], Field(max_length=255)] = ()
     tone_snr_db: float | None = None
     """Instead of that of ``[simulation]``."""
     ground: Literal["none", "estimated", "ignored"] = "estimated"

@@ -39,10 +39,12 @@ N_BLOCK = 64
 # what is added up over a day
 (
     STEPS, SQUARE, WORST, BEAM_SQUARE, BEAM_WORST, ENERGY, CAUGHT, MOTOR_1, MOTOR_2, STARTS, OUT_OF_REACH,
-    OUTAGE_STEPS, OUTAGE_SQUARE, OUTAGE_ENERGY, OUTAGE_CAUGHT, FRAMES, FRAMES_LOST, COLD,
-    SUNSHINE, BURSTS, BURST_ERROR, TURNING, FRESH_ENERGY, FRESH_CAUGHT,
-) = range(24)  # fmt: skip
-N_SUM = 24
+    FRAMES, FRAMES_LOST, COLD, SUNSHINE, BURSTS, BURST_ERROR, TURNING, FRESH_ENERGY, FRESH_CAUGHT,
+) = range(20)  # fmt: skip
+N_SUM = 20
+
+# while radio is out, by outage
+OUT_STEPS, OUT_SQUARE, OUT_ENERGY, OUT_CAUGHT = range(4)
 
 # by mode of the field control, or all under one where there is none
 MODE_S, MODE_OFFERED, MODE_CAUGHT = range(3)
@@ -265,7 +267,7 @@ def _track(
     loop, law, drive_1, drive_2, table,
     step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
     p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, hours, hour_of, histogram,
+    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
     stride, trace_error, trace_light, trace, keeps, light, scratch,
 ):  # fmt: skip
     """One mirror through a stretch of steps; see `advance`."""
@@ -488,8 +490,8 @@ def _track(
                     total[BURST_ERROR] += angle
                     total[TURNING] += angle * k[13] / drive_1.speed * loop.servo_s
                 if dark:
-                    total[OUTAGE_STEPS] += 1.0
-                    total[OUTAGE_SQUARE] += angle * angle
+                    by_outage[outage[s] - 1, OUT_STEPS] += 1.0
+                    by_outage[outage[s] - 1, OUT_SQUARE] += angle * angle
                 if tick:
                     energy = power[s] * loop.interval * facing
                     caught = power[s] * loop.interval * light[0]
@@ -499,8 +501,8 @@ def _track(
                         total[FRESH_ENERGY] += energy
                         total[FRESH_CAUGHT] += caught
                     if dark:
-                        total[OUTAGE_ENERGY] += energy
-                        total[OUTAGE_CAUGHT] += caught
+                        by_outage[outage[s] - 1, OUT_ENERGY] += energy
+                        by_outage[outage[s] - 1, OUT_CAUGHT] += caught
         if s % stride == 0:
             i_trace = s // stride
             trace_error[i_trace] = angle if scored and state[UNREACHABLE] == 0.0 else np.nan
@@ -565,7 +567,7 @@ def advance(
     loop, law, drive_1, drive_2, table,
     step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
     p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, hours, hour_of, histogram,
+    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
     stride, trace_error, trace_light, stored, trace, light,
 ):  # fmt: skip
     """Take all mirrors through steps ``first`` to ``end`` of a stretch, in place of ``model, cov, state, ring``, sums.
@@ -580,7 +582,8 @@ def advance(
     ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model`` what the controller
     believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz); ``target`` (xyz, 1 for
     a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``swing`` (step, 4) and ``noise`` (frame, 2) of variance
-    one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step);
+    one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step): 0, or
+    which one is on, from 1;
     ``power`` (step) [W/m²], negative outside the field's hours; ``drift`` of plate or sensor [rad]; ``trace_error``,
     ``trace_light`` (trace, 2); ``stored`` row of ``trace`` or −1; ``trace`` (stored, trace, 8); ``light`` (2) caught
     and offered, as parts of the beam, at the last step.
@@ -596,6 +599,6 @@ def advance(
                 step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
                 p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
                 mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-                sensor[h], state[h], ring[h], total[h], by_mode[h], hours[h], hour_of, histogram[h], stride,
+                sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h], stride,
                 trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
             )  # fmt: skip

@@ -31,7 +31,7 @@ _FIRST_SIGMA_RAD = 0.3e-3
 _FREE = np.array([list(PARAMETERS).index(name) for name in LEARNED])
 _SCALE = np.array([PARAMETERS[name] for name in LEARNED])
 _ARRAYS = (
-    "model", "cov", "state", "ring", "total", "by_mode", "hours", "histogram", "curve", "trace", "stored_error",
+    "model", "cov", "state", "ring", "total", "by_mode", "by_outage", "hours", "histogram", "curve", "trace", "stored_error",
     "light", "mode_count", "mode",
 )  # fmt: skip
 
@@ -98,6 +98,8 @@ class Sums:
         Sums by the kernels' names.
     by_mode : (day, mirror, mode, 3)
         Seconds, light offered and caught [J/m²] while the field was to work, by `Mode`.
+    by_outage : (mirror, outage, 4)
+        Steps, squared normal errors, light offered and caught while radio was out, all days.
     hours : (mirror, 24, 2)
         Steps and squared normal errors by hour of local mean solar time.
     histogram : (mirror, bin)
@@ -106,6 +108,7 @@ class Sums:
 
     total: FloatArray
     by_mode: FloatArray
+    by_outage: FloatArray
     hours: FloatArray
     histogram: npt.NDArray[np.int64]
 
@@ -170,6 +173,7 @@ class MethodRun:
         self.ring = np.zeros((n, _kernels.N_RING, _kernels.N_ENTRY))
         self.total = np.zeros((len(world.days), n, _kernels.N_SUM))
         self.by_mode = np.zeros((len(world.days), n, len(Mode), 3))
+        self.by_outage = np.zeros((n, max(len(world.scenario.tracking.radio.outages), 1), 4))
         self.hours = np.zeros((n, 24, 2))
         self.histogram = np.zeros((n, _kernels.N_BIN), np.int64)
         self.curve = np.full((n_time, 4), np.nan)
@@ -263,8 +267,8 @@ class MethodRun:
                 told.age, true, field.constant, field.lean_rad, heat, self.model, cov, _FREE, _SCALE, walk, sun,
                 field.target, draws.gust, world.gusts.mean_mps, world.gusts.bend, draws.swing, draws.noise,
                 draws.spread, draws.bias, draws.lost, draws.outage, power, drift, field.sensor_bias_rad,
-                self.state, self.ring, self.total[segment.i_day], self.by_mode[segment.i_day], self.hours, hour_of,
-                self.histogram, world.stride, error, light, kept, trace, self.light,
+                self.state, self.ring, self.total[segment.i_day], self.by_mode[segment.i_day], self.by_outage, self.hours,
+                hour_of, self.histogram, world.stride, error, light, kept, trace, self.light,
             )  # fmt: skip
             s = end
         at = slice(segment.first_stored, segment.first_stored + n_kept)
@@ -291,6 +295,7 @@ class MethodRun:
         return Sums(
             total=read_only(self.total),
             by_mode=read_only(self.by_mode),
+            by_outage=read_only(self.by_outage[:, : len(self._world.scenario.tracking.radio.outages)]),
             hours=read_only(self.hours),
             histogram=read_only(self.histogram),
         )

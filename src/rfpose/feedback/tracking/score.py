@@ -39,10 +39,9 @@ class Score:
     day_rms_rad, day_worst_heliostat_rad : (day,)
         Over the field; the worst mirror's rms.
     day_intercept : (day,)
-    outage_rms_rad, outage_intercept
-        While radio was out.
-    outage_loss_j_per_m2
-        Light spilt meanwhile, by mirror, beyond what is spilt at other times.
+    outage_rms_rad, outage_intercept, outage_loss_j_per_m2 : (outage,)
+        While radio was out, outage by outage; the last is light spilt by mirror, beyond what is spilt at other times.
+        NaN where nothing was scored meanwhile.
     sunshine_s, bursts
         Time with the sun out, and how often it came out, by mirror.
     burst_error_rad
@@ -81,9 +80,9 @@ class Score:
     day_rms_rad: FloatArray
     day_worst_heliostat_rad: FloatArray
     day_intercept: FloatArray
-    outage_rms_rad: float
-    outage_intercept: float
-    outage_loss_j_per_m2: float
+    outage_rms_rad: FloatArray
+    outage_intercept: FloatArray
+    outage_loss_j_per_m2: FloatArray
     sunshine_s: float
     bursts: float
     burst_error_rad: float
@@ -113,11 +112,15 @@ class Score:
             "day_rms_mrad": 1e3 * self.day_rms_rad,
             "day_intercept": self.day_intercept,
             "hour_rms_mrad": 1e3 * self.hour_rms_rad,
-            "outage": {
-                "rms_mrad": 1e3 * self.outage_rms_rad,
-                "intercept": self.outage_intercept,
-                "loss_kwh_per_m2": self.outage_loss_j_per_m2 / 3.6e6,
-            },
+            "outages": [
+                {"rms_mrad": 1e3 * rms, "intercept": intercept, "loss_kwh_per_m2": loss / 3.6e6}
+                for rms, intercept, loss in zip(
+                    self.outage_rms_rad.tolist(),
+                    self.outage_intercept.tolist(),
+                    self.outage_loss_j_per_m2.tolist(),
+                    strict=True,
+                )
+            ],
             "sunshine": {
                 "hours": self.sunshine_s / 3600.0,
                 "bursts": self.bursts,
@@ -152,11 +155,7 @@ def score(sums: Sums) -> Score:
     day = total.sum(axis=1)
     hours = sums.hours.sum(axis=0)
     intercept = _ratio(everything[kernels.CAUGHT], everything[kernels.ENERGY])
-    dark = _ratio(everything[kernels.OUTAGE_CAUGHT], everything[kernels.OUTAGE_ENERGY])
-    lit = _ratio(
-        everything[kernels.CAUGHT] - everything[kernels.OUTAGE_CAUGHT],
-        everything[kernels.ENERGY] - everything[kernels.OUTAGE_ENERGY],
-    )
+    out = sums.by_outage.sum(axis=0)
     fresh = everything[kernels.FRESH_ENERGY], everything[kernels.FRESH_CAUGHT]
     settled = _ratio(everything[kernels.CAUGHT] - fresh[1], everything[kernels.ENERGY] - fresh[0])
     lost_j = float((settled - _ratio(fresh[1], fresh[0])) * fresh[0])
@@ -167,6 +166,13 @@ def score(sums: Sums) -> Score:
         day_rms = np.sqrt(day[:, kernels.SQUARE] / day[:, kernels.STEPS])
         caught = by_mirror[:, kernels.CAUGHT] / by_mirror[:, kernels.ENERGY]
         day_caught = day[:, kernels.CAUGHT] / day[:, kernels.ENERGY]
+        out_rms = np.sqrt(out[:, kernels.OUT_SQUARE] / out[:, kernels.OUT_STEPS])
+        out_caught = out[:, kernels.OUT_CAUGHT] / out[:, kernels.OUT_ENERGY]
+    lit = _ratio(
+        everything[kernels.CAUGHT] - out[:, kernels.OUT_CAUGHT].sum(),
+        everything[kernels.ENERGY] - out[:, kernels.OUT_ENERGY].sum(),
+    )
+    out_loss = np.maximum(lit - out_caught, 0.0) * out[:, kernels.OUT_ENERGY] / n_mirror
     scored = by_mirror[:, kernels.STEPS] > 0.0
     by_mode = sums.by_mode.sum(axis=0).mean(axis=0)
     return Score(
@@ -187,11 +193,9 @@ def score(sums: Sums) -> Score:
         day_rms_rad=read_only(day_rms),
         day_worst_heliostat_rad=read_only(np.array([_largest(row) for row in by_day])),
         day_intercept=read_only(day_caught),
-        outage_rms_rad=float(np.sqrt(_ratio(everything[kernels.OUTAGE_SQUARE], everything[kernels.OUTAGE_STEPS]))),
-        outage_intercept=dark,
-        outage_loss_j_per_m2=float(max(lit - dark, 0.0) * everything[kernels.OUTAGE_ENERGY] / n_mirror)
-        if np.isfinite(dark)
-        else 0.0,
+        outage_rms_rad=read_only(out_rms),
+        outage_intercept=read_only(out_caught),
+        outage_loss_j_per_m2=read_only(out_loss),
         sunshine_s=float(everything[kernels.SUNSHINE]) / n_mirror,
         bursts=float(everything[kernels.BURSTS]) / n_mirror,
         burst_error_rad=_ratio(everything[kernels.BURST_ERROR], everything[kernels.BURSTS]),

@@ -193,13 +193,13 @@ class Simulation:
         return geometry.bisector_enu(self.field.target[:, :3] - self.field.pivot_enu_m, sun)
 
     def _outage(self, hour: FloatArray) -> npt.NDArray[np.uint8]:
-        """(mirror, step) one where the radio is lost."""
+        """(mirror, step) which of the outages has taken the radio, from 1; 0 none."""
         n = len(self.field)
         out = np.zeros((n, len(hour)), np.uint8)
         for i, outage in enumerate(self.scenario.tracking.radio.outages):
             dark = (hour >= outage.first_hour) & (hour < outage.last_hour)
             hit = generator(self.seed, 8, i).random(n) < outage.share
-            out |= (hit[:, None] & dark[None]).astype(np.uint8)
+            out[hit[:, None] & dark[None]] = i + 1
         return out
 
     # -- results -------------------------------------------------------------------------------------------
