@@ -1,20 +1,73 @@
-"""A tracking run as arrays to draw: mirrors, beams at the target, error curves of all methods."""
+"""A tracking run as arrays to draw: mirrors, beams at the target, curves of all methods, what happened and when."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.geometry import unit
 from rfpose.pipeline.track_file import Track
+from rfpose.scenario.tracking import Event
 
-__all__ = ["Instant", "TrackPicture", "instant_at", "picture_of_track"]
+__all__ = [
+    "MODES",
+    "ON_RECEIVER",
+    "Happening",
+    "Instant",
+    "TrackPicture",
+    "clock",
+    "groups",
+    "instant_at",
+    "local_hour",
+    "mode_text",
+    "picture_of_track",
+    "what_happened",
+]
 
+MODES = tuple(mode.name.lower() for mode in Mode)
+ON_RECEIVER = (int(Mode.POINT), int(Mode.TRACK))
+"""Modes in which a mirror's light is meant for the receiver; only there its error is scored."""
+_NO_BEAM = (int(Mode.STOW), int(Mode.STOWING), int(Mode.APPROACH), int(Mode.EMERGENCY))
+_ASTRAY = 0.25
+"""Beams of other mirrors off the receiver are drawn if they pass the target within this part of their way."""
 _DAY_GAP_S = 3600.0
 """Between two simulated days the curves show a gap of this length, whatever lies between them."""
+_NAMED = 3
+"""Of so many mirrors an event is told with their names."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Happening:
+    """Something that happened to the field of one method.
+
+    Attributes
+    ----------
+    day
+        Of the run, from 0.
+    hour
+        Local mean solar time [h]; NaN: no time is kept of it.
+    kind
+        What it is.
+    mark
+        A word or three for the time axis; empty: it has no place there.
+    text
+        In full.
+    trouble
+        Whether an order was refused, or it did not end well.
+    """
+
+    day: int
+    hour: float
+    kind: Literal["event", "alarm", "calibration", "messages"]
+    mark: str
+    text: str
+    trouble: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,17 +78,26 @@ class Instant:
     ----------
     normal_enu : (stored, xyz)
     error_mrad : (stored,)
-        Angle between true and wanted normal [mrad of the normal]; NaN: aim point out of reach.
+        Angle between true and wanted normal [mrad of the normal]; NaN: not on the receiver, or aim point out of reach.
     beam_end_enu_m : (stored, xyz)
-        Where the sun's reflection passes the target [m]; NaN for a dish, or for a beam that leads away from it.
+        Where the sun's reflection passes the target [m]; NaN for a dish, for a beam that leads away from it, and for
+        mirrors in stow or on their way there and back.
     spot_m : (stored, xy)
         The same, from the aim point: to the right and up as seen from the mirror [m].
+    mode : (stored,)
+        Numbers of `MODES`.
     """
 
     normal_enu: FloatArray
     error_mrad: FloatArray
     beam_end_enu_m: FloatArray
     spot_m: FloatArray
+    mode: npt.NDArray[np.int64]
+
+    @property
+    def on_receiver(self) -> npt.NDArray[np.bool_]:
+        """Whether a mirror's light is meant for the receiver (stored,)."""
+        return np.isin(self.mode, ON_RECEIVER)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,13 +115,19 @@ class TrackPicture:
     time
         UTC of each instant, ISO 8601.
     rms_mrad : name to (time,)
-        Over the whole field [mrad of the normal].
+        Over all mirrors on the receiver [mrad of the normal]; NaN while there are none.
+    flux : name to (time,)
+        Light on the receiver over that of a perfect field on its aim.
+    happened : name to happenings
+        In the order of days and hours; those without a time at the end of their day.
     pivot_enu_m, target_enu_m : (stored, xyz)
         [m].
     ids
         Of the stored mirrors.
     limit_mrad
         Error that the colours reach to: nearly all of the run lies below.
+    spot_limit_m
+        How far from the aim point beams with that error pass [m]; NaN for dishes.
     """
 
     track: Track
@@ -67,15 +135,23 @@ class TrackPicture:
     hours: FloatArray
     time: tuple[str, ...]
     rms_mrad: Mapping[str, FloatArray]
+    flux: Mapping[str, FloatArray]
+    happened: Mapping[str, tuple[Happening, ...]]
     pivot_enu_m: FloatArray
     target_enu_m: FloatArray
     ids: tuple[str, ...]
     limit_mrad: Mapping[str, float]
+    spot_limit_m: Mapping[str, float]
 
     @property
     def n_instant(self) -> int:
         """Number of instants."""
         return len(self.hours)
+
+    @property
+    def under_field_control(self) -> bool:
+        """Whether mirrors had modes, messages and events."""
+        return any(method.happened for method in self.track.methods.values())
 
     def at(self, method: str, instant: int) -> Instant:
         """Return what a method's mirrors did at an instant."""
@@ -86,10 +162,39 @@ class TrackPicture:
             self.track.sun_enu[instant],
             self.pivot_enu_m,
             self.target_enu_m,
+            mode=np.asarray(series["mode"][instant], np.int64),
         )
 
-    def comparison(self, instant: int) -> list[tuple[str, float, float, float, float, float]]:
-        """Return rows of method, error now, rms, 95 %, worst [mrad of the normal] and intercept; best first."""
+    def mode_counts(self, method: str, instant: int) -> dict[int, int]:
+        """Return how many mirrors of the whole field are in each mode that the method's run knows at any time."""
+        count = self.track.methods[method].series["mode_count"]
+        return {int(k): int(count[instant, k]) for k in np.flatnonzero(count.any(axis=0))}
+
+    def place_h(self, happening: Happening) -> float:
+        """Return where on `hours` something happened; NaN: nowhere."""
+        first = int(np.argmax(self.track.day == happening.day))
+        return float(self.hours[first]) + happening.hour - float(local_hour(self.track)[first])
+
+    def mirror_text(self, method: str, instant: int, row: int) -> str:
+        """Return what a stored mirror does at an instant, in words."""
+        now, day = self.at(method, instant), self.track.day
+        mode = self.track.methods[method].series["mode"][:, row]
+        before = np.flatnonzero((mode[:instant] != mode[instant]) | (day[:instant] != day[instant]))
+        since = int(before[-1]) + 1 if before.size else 0
+        text = f"{self.ids[row]}: {mode_text(int(mode[instant]))}"
+        if since and day[since - 1] == day[instant]:
+            text += f" since {clock(float(local_hour(self.track)[since]))}"
+        if not now.on_receiver[row]:
+            return f"{text}, not on the receiver"
+        if not np.isfinite(now.error_mrad[row]):
+            return f"{text}, cannot face its aim point"
+        return f"{text}, error {now.error_mrad[row]:.3g} mrad of the normal"
+
+    def comparison(self, instant: int) -> list[tuple[str, float, float, float, float, float, float]]:
+        """Return rows of method, error now, rms, 95 %, worst [mrad of the normal], intercept, availability.
+
+        The best is first.
+        """
         rows = []
         for name in self.track.ranking():
             scores = self.track.methods[name].scores
@@ -102,6 +207,7 @@ class TrackPicture:
                     1e3 * _largest(scores["heliostat_p95_rad"]),
                     1e3 * _largest(scores["heliostat_worst_rad"]),
                     _mean(scores["heliostat_intercept"]),
+                    _number(self.track.methods[name].summary.get("availability")),
                 )
             )
         return rows
@@ -113,8 +219,14 @@ def instant_at(
     sun_enu: FloatArray,
     pivot_enu_m: FloatArray,
     target_enu_m: FloatArray,
+    *,
+    mode: npt.NDArray[np.int64] | None = None,
 ) -> Instant:
-    """Return mirrors with these normals (mirror, xyz) and errors (mirror,), and where their beams go."""
+    """Return mirrors with these normals (mirror, xyz) and errors (mirror,), and where their beams go.
+
+    Without ``mode`` (mirror,) all are taken to be on the receiver.
+    """
+    mode = np.full(len(normal_enu), int(Mode.TRACK)) if mode is None else mode
     ray = 2.0 * (normal_enu @ sun_enu)[:, None] * normal_enu - sun_enu
     ahead = target_enu_m - pivot_enu_m
     distance = np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -122,6 +234,8 @@ def instant_at(
     with np.errstate(invalid="ignore", divide="ignore"):
         towards = np.einsum("mx,mx->m", ray, along)[:, None]
         end = pivot_enu_m + ray * np.where(towards > 0.05, distance / towards, np.nan)
+        astray = np.linalg.norm(end - target_enu_m, axis=1) > _ASTRAY * distance[:, 0]
+    end[np.isin(mode, _NO_BEAM) | (astray & ~np.isin(mode, ON_RECEIVER))] = np.nan
     right = unit(np.cross(along, [0.0, 0.0, 1.0]))
     up = np.cross(right, along)
     miss = end - target_enu_m
@@ -130,6 +244,7 @@ def instant_at(
         error_mrad=1e3 * error_rad,
         beam_end_enu_m=end,
         spot_m=np.stack([np.einsum("mx,mx->m", miss, right), np.einsum("mx,mx->m", miss, up)], axis=1),
+        mode=mode,
     )
 
 
@@ -141,6 +256,10 @@ def _mean(values: FloatArray) -> float:
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)
+
+
 def picture_of_track(track: Track) -> TrackPicture:
     """Return a run, ready to be scrubbed through."""
     step = np.diff(track.unix_s, prepend=track.unix_s[:1])
@@ -150,14 +269,138 @@ def picture_of_track(track: Track) -> TrackPicture:
         error = np.abs(np.asarray(method.series["error_rad"], np.float64))
         known = error[np.isfinite(error)]
         limits[name] = max(1e3 * float(np.percentile(known, 98)), 1e-6) if known.size else 1.0
+    pivot, target = track.pivot_enu_m[track.stored], track.target_enu_m[track.stored]
+    farthest = _largest(np.linalg.norm(target - pivot, axis=1)) if len(pivot) else float("nan")
     return TrackPicture(
         track=track,
         methods=tuple(track.methods),
         hours=np.cumsum(step) / 3600.0,
         time=tuple(str(t) for t in np.round(track.unix_s).astype("datetime64[s]")),
         rms_mrad={name: 1e3 * np.asarray(m.series["rms_rad"], np.float64) for name, m in track.methods.items()},
-        pivot_enu_m=track.pivot_enu_m[track.stored],
-        target_enu_m=track.target_enu_m[track.stored],
+        flux={name: np.asarray(m.series["flux"], np.float64) for name, m in track.methods.items()},
+        happened={name: what_happened(track, name) for name in track.methods},
+        pivot_enu_m=pivot,
+        target_enu_m=target,
         ids=tuple(track.heliostat_ids[i] for i in track.stored),
         limit_mrad=limits,
+        spot_limit_m={name: 2e-3 * limit * farthest for name, limit in limits.items()},
+    )
+
+
+def mode_text(mode: int) -> str:
+    """Return a mode's name as words; negative: none is kept."""
+    return MODES[mode].replace("_", " ") if mode >= 0 else "–"
+
+
+def local_hour(track: Track) -> FloatArray:
+    """Return local mean solar time of all instants (time,) [h]."""
+    return np.asarray(np.mod(track.unix_s / 3600.0 + (track.scenario.site.longitude_deg or 0.0) / 15.0, 24.0))
+
+
+def clock(hour: float) -> str:
+    """Return an hour of the day as hours and minutes; nothing for NaN."""
+    if not np.isfinite(hour):
+        return ""
+    minutes = round(60.0 * hour)
+    return f"{minutes // 60 % 24:02d}:{minutes % 60:02d}"
+
+
+def groups(places: Sequence[float], least: float) -> list[list[int]]:
+    """Return indices of sorted places, those together that are less than ``least`` from the first of their group."""
+    found: list[list[int]] = []
+    for i, place in enumerate(places):
+        if found and place - places[found[-1][0]] < least:
+            found[-1].append(i)
+        else:
+            found.append([i])
+    return found
+
+
+def what_happened(track: Track, method: str) -> tuple[Happening, ...]:
+    """Return what happened to a method's field, in the order of days and hours; empty without field control."""
+    hour = local_hour(track)
+    found: list[Happening] = []
+    for day, report in enumerate(track.methods[method].happened):
+        begin = float(hour[int(np.argmax(track.day == day))])
+        agenda = [event for event in track.scenario.tracking.event if event.day in (None, day + 1)]
+        timed = [_event(day, entry, agenda, len(track.heliostat_ids)) for entry in report["events"]]
+        timed += [_alarm(day, entry, begin + entry["at_s"] / 3600.0) for entry in report["alarms"]]
+        found += sorted(timed, key=lambda each: each.hour)
+        found += [_calibration(day, entry) for entry in report["calibrations"]]
+        found.append(_messages(day, report["messages"]))
+    return tuple(found)
+
+
+def _event(day: int, entry: Mapping[str, Any], agenda: list[Event], n_mirror: int) -> Happening:
+    what, who = entry["what"].replace("-", " "), _who(entry, agenda, n_mirror)
+    text = f"{what}: {who}" if who else str(what)
+    refused: Mapping[str, int] = entry.get("refused", {})
+    if refused:
+        reasons = (f"{count} × {why.partition(' refused: ')[2] or why}" for why, count in refused.items())
+        text += f"; refused: {', '.join(reasons)}"
+    mark = f"{what} {who}" if who and len(who) <= 4 else str(what)
+    return Happening(day=day, hour=entry["hour"], kind="event", mark=mark, text=text, trouble=bool(refused))
+
+
+def _who(entry: Mapping[str, Any], agenda: list[Event], n_mirror: int) -> str:
+    """Return whom an event concerned, by the scenario's own words where they are short; empty: all the field."""
+    for i, event in enumerate(agenda):
+        if event.what == entry["what"] and event.hour == entry["hour"]:
+            del agenda[i]  # two of the same hour are two entries
+            if event.cluster is not None:
+                return f"cluster {event.cluster}"
+            if 0 < len(event.heliostats) <= _NAMED:
+                return ", ".join(event.heliostats)
+            break
+    return "" if entry["heliostats"] == n_mirror else _mirrors(entry["heliostats"])
+
+
+def _mirrors(n: int) -> str:
+    return "1 mirror" if n == 1 else f"{n} mirrors"
+
+
+def _alarm(day: int, entry: Mapping[str, Any], hour: float) -> Happening:
+    parts = []
+    for key, what in (
+        ("below_tenth_s", "flux below a tenth"),
+        ("off_s", "last mirror off"),
+        ("stowed_median_s", "half stowed"),
+        ("stowed_s", "all stowed"),
+    ):
+        after = entry[key]
+        parts.append(f"{what} after {after:.0f} s" if after is not None else f"{what}: not within half an hour")
+    late = any(entry[key] is None for key in ("below_tenth_s", "off_s", "stowed_s"))
+    text = f"alarm, {entry['alarm']}: {', '.join(parts)}"
+    return Happening(day=day, hour=hour, kind="alarm", mark=entry["alarm"], text=text, trouble=late)
+
+
+def _calibration(day: int, entry: Mapping[str, Any]) -> Happening:
+    text = f"{entry['heliostat']} calibrated: {entry['outcome']}{' after a search' if entry['searched'] else ''}"
+    if entry["offset_mm"] is not None:
+        text += f", {np.hypot(*entry['offset_mm']):.0f} mm beside the middle"
+    return Happening(
+        day=day,
+        hour=float("nan"),
+        kind="calibration",
+        mark="",
+        text=f"{text}, took {entry['took_s']:.0f} s",
+        trouble=entry["outcome"] not in ("on target", "corrected"),
+    )
+
+
+def _messages(day: int, entry: Mapping[str, int]) -> Happening:
+    parts = []
+    for key, what in (("sun", "sun angles"), ("question", "questions"), ("answer", "answers")):
+        by_fate = {name.partition("_")[2]: n for name, n in entry.items() if name.startswith(f"{key}_")}
+        missed = sum(by_fate.values()) - by_fate.get("ok", 0)
+        parts.append(f"{100.0 * missed / max(sum(by_fate.values()), 1):.1f} % of {what}")
+    refused, alone = entry["orders_refused"], entry["watchdog_emergencies"]
+    return Happening(
+        day=day,
+        hour=float("nan"),
+        kind="messages",
+        mark="",
+        text=f"messages missed: {', '.join(parts)}; {entry['orders_sent']} orders sent, {refused} refused by mirrors; "
+        f"{alone} emergencies by watchdog",
+        trouble=refused > 0 or alone > 0,
     )
