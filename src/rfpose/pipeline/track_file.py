@@ -202,8 +202,10 @@ def _plain(found: Mapping[str, Any]) -> dict[str, Any]:
     def plain(value: Any) -> Any:
         if isinstance(value, Mapping):
             return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, np.ndarray):
-            return [plain(item) for item in value.tolist()]
+        if isinstance(value, np.ndarray | list):
+            return [plain(item) for item in value]
+        if isinstance(value, np.generic):
+            value = value.item()
         return None if value is None or not np.isfinite(value) else value
 
     result: dict[str, Any] = plain(found)

@@ -582,9 +582,9 @@ def advance(
     ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model`` what the controller
     believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz); ``target`` (xyz, 1 for
     a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``swing`` (step, 4) and ``noise`` (frame, 2) of variance
-    one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step): 0, or
-    which one is on, from 1;
-    ``power`` (step) [W/m²], negative outside the field's hours; ``drift`` of plate or sensor [rad]; ``trace_error``,
+    one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step):
+    0, or which one is on, from 1; ``power`` (step) [W/m²], negative outside the field's hours;
+    ``drift`` of plate or sensor [rad]; ``trace_error``,
     ``trace_light`` (trace, 2); ``stored`` row of ``trace`` or −1; ``trace`` (stored, trace, 8); ``light`` (2) caught
     and offered, as parts of the beam, at the last step.
     """
@@ -599,6 +599,6 @@ def advance(
                 step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
                 p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
                 mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-                sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h], stride,
-                trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
+                sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h],
+                stride, trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
             )  # fmt: skip

@@ -334,8 +334,9 @@ class LiveField:
             self._plan.gusts.bend, self._plan.gusts.draw_swing(rng, (n, n_step)), noise,
             self._radio_errors.spread_rad, self._radio_errors.bias_rad, lost, np.zeros((n, n_step), np.uint8),
             day.power_w_per_m2[steps].copy(), field.plate_drift_rad, field.sensor_bias_rad,
-            run.state, run.ring, run.total[0], run.by_mode[0], run.by_outage, run.hours, day.hour[steps].astype(np.int64),
-            run.histogram, 1, error, np.zeros((n, n_step, 2)), np.arange(n), trace, run.light,
+            run.state, run.ring, run.total[0], run.by_mode[0], run.by_outage, run.hours,
+            day.hour[steps].astype(np.int64), run.histogram, 1, error, np.zeros((n, n_step, 2)), np.arange(n),
+            trace, run.light,
         )  # fmt: skip
 
     def _obey(self, control: FieldControl, i_step: int, told: Told) -> npt.NDArray[np.int8]:

@@ -31,8 +31,8 @@ _FIRST_SIGMA_RAD = 0.3e-3
 _FREE = np.array([list(PARAMETERS).index(name) for name in LEARNED])
 _SCALE = np.array([PARAMETERS[name] for name in LEARNED])
 _ARRAYS = (
-    "model", "cov", "state", "ring", "total", "by_mode", "by_outage", "hours", "histogram", "curve", "trace", "stored_error",
-    "light", "mode_count", "mode",
+    "model", "cov", "state", "ring", "total", "by_mode", "by_outage", "hours", "histogram", "curve", "trace",
+    "stored_error", "light", "mode_count", "mode",
 )  # fmt: skip
 
 
@@ -267,8 +267,8 @@ class MethodRun:
                 told.age, true, field.constant, field.lean_rad, heat, self.model, cov, _FREE, _SCALE, walk, sun,
                 field.target, draws.gust, world.gusts.mean_mps, world.gusts.bend, draws.swing, draws.noise,
                 draws.spread, draws.bias, draws.lost, draws.outage, power, drift, field.sensor_bias_rad,
-                self.state, self.ring, self.total[segment.i_day], self.by_mode[segment.i_day], self.by_outage, self.hours,
-                hour_of, self.histogram, world.stride, error, light, kept, trace, self.light,
+                self.state, self.ring, self.total[segment.i_day], self.by_mode[segment.i_day], self.by_outage,
+                self.hours, hour_of, self.histogram, world.stride, error, light, kept, trace, self.light,
             )  # fmt: skip
             s = end
         at = slice(segment.first_stored, segment.first_stored + n_kept)

@@ -27,7 +27,7 @@ from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme, colour_table, see_through
 from rfpose.viewer.workers import Workers
 
-__all__ = ["Dots", "Plan", "Scale", "Table", "View", "keep_axes", "plot_in", "segments"]
+__all__ = ["Dots", "Plan", "Scale", "Table", "View", "keep_axes", "pick_on_click", "plot_in", "segments"]
 
 _PICK_PX = 14.0
 _LEVELS = 64
@@ -175,6 +175,19 @@ class Dots(pg.GraphicsObject):  # type: ignore[misc]
         return best if across[best] <= max(_PICK_PX, self._size) else None
 
 
+def pick_on_click(plot: Any, dots: Dots, heard: Callable[[int], None]) -> None:
+    """Call ``heard`` with the index of a dot that is clicked on a plot."""
+
+    def clicked(event: Any) -> None:
+        if event.button() != Qt.MouseButton.LeftButton or not plot.sceneBoundingRect().contains(event.scenePos()):
+            return
+        index = dots.nearest(plot.vb.mapSceneToView(event.scenePos()))
+        if index is not None:
+            heard(index)
+
+    plot.scene().sigMouseClicked.connect(clicked)
+
+
 class Scale:
     """Colours for a quantity, with a bar that says what they mean."""
 
@@ -275,14 +288,7 @@ class Plan:
 
     def on_click(self, heard: Callable[[int], None]) -> None:
         """Call ``heard`` with the index of a heliostat that is clicked."""
-        self.plot.scene().sigMouseClicked.connect(lambda event: self._clicked(event, heard))
-
-    def _clicked(self, event: Any, heard: Callable[[int], None]) -> None:
-        if event.button() != Qt.MouseButton.LeftButton or not self.plot.sceneBoundingRect().contains(event.scenePos()):
-            return
-        index = self.dots.nearest(self.plot.vb.mapSceneToView(event.scenePos()))
-        if index is not None:
-            heard(index)
+        pick_on_click(self.plot, self.dots, heard)
 
 
 class Table(QTableWidget):
