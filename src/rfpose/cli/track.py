@@ -62,6 +62,11 @@ _METHODS = (
 @click.option(
     "--without-field-control", is_flag=True, help="Track from the first second: no modes, messages and events."
 )
+@click.option(
+    "--check-iq",
+    metavar="NAMES",
+    help="Also take these mirrors through samples and the whole chain in 16 postures: does the radio model hold?",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
@@ -79,6 +84,7 @@ def command(
     sky: str | None,
     events: tuple[str, ...],
     without_field_control: bool,
+    check_iq: str | None,
     seed: int,
     csv_path: Path | None,
     picture: Path | None,
@@ -110,6 +116,7 @@ def command(
             sky=sky,
             events=[_event(text) for text in events],
             without_field_control=without_field_control,
+            check_iq=tuple(name.strip() for name in check_iq.split(",")) if check_iq else (),
             seed=seed,
             force=force,
             on_progress=on_progress,
@@ -133,6 +140,11 @@ def command(
     )
     say("  rms, 95 % and worst of all mirrors and seconds; rms of the worst mirror; part of a perfect tracker's light")
     say("  caught, light caught by a square metre of mirror; motor steps a mirror and day")
+    for each in summary["iq"]:
+        say(
+            f"  {each['heliostat']} from samples: {each['solved']} of {each['postures']} postures, "
+            f"{each['error_rms_mrad']:.3g} mrad rms; by the model {each['model_rms_mrad']:.3g}"
+        )
     for name in summary["ranking"]:
         for i, outage in enumerate(summary["methods"][name]["outages"] if name.startswith("radio") else (), start=1):
             if outage["rms_mrad"] is not None:

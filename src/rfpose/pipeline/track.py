@@ -13,6 +13,7 @@ from rfpose.feedback.tracking import Simulation
 from rfpose.pipeline._checkpoint import Checkpoint
 from rfpose.pipeline.files import refuse_existing
 from rfpose.pipeline.track_file import Track, track_of, write_track
+from rfpose.pipeline.track_iq import check_with_iq
 from rfpose.scenario import Scenario, check_scenario, load_scenario
 
 __all__ = ["track"]
@@ -29,6 +30,7 @@ def track(
     sky: str | None = None,
     events: Sequence[Mapping[str, Any]] = (),
     without_field_control: bool = False,
+    check_iq: Sequence[str] = (),
     seed: int = 0,
     force: bool = False,
     checkpoint_s: float = 20.0,
@@ -55,6 +57,8 @@ def track(
         Happenings besides those of ``[[tracking.event]]``, with the same keys.
     without_field_control
         Track from the first second, without modes, messages and events.
+    check_iq
+        Names of mirrors of which samples are made and processed, to see that the radio model holds.
     seed
         Same scenario and seed, same result.
     force
@@ -92,6 +96,10 @@ def track(
         key["wind"] = hashlib.sha256(Path(scenario.tracking.wind.record).read_bytes()).hexdigest()
     place = result_path.with_name(f".{result_path.name}.state")
     checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
+    try:
+        iq = check_with_iq(scenario, check_iq, seed=seed)
+    except InvalidInputError as error:
+        raise ScenarioError(f"{scenario_path}: {error}") from error
     state = checkpoint.read()
     if state is not None:
         simulation.restore(state)
@@ -100,7 +108,7 @@ def track(
         checkpoint.write(simulation.state())
         if on_progress is not None:
             on_progress(simulation.done, simulation.n_segment)
-    found = track_of(simulation, settings)
+    found = track_of(simulation, settings, iq=iq)
     write_track(found, result_path)
     checkpoint.remove()
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from rfpose.errors import RecordingError, ScenarioError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.track_iq import IqCheck
 from rfpose.scenario import Scenario, parse_scenario
 
 __all__ = [
@@ -116,6 +117,8 @@ class Track:
         Instants of the series.
     methods
         By name, in the order of the run.
+    iq
+        Mirrors of which samples were made, as `rfpose.pipeline.track_iq.IqCheck.as_dict` has them.
     """
 
     scenario: Scenario
@@ -129,6 +132,7 @@ class Track:
     day: npt.NDArray[np.int64]
     sun_enu: FloatArray
     methods: Mapping[str, MethodTrack]
+    iq: tuple[Mapping[str, Any], ...] = ()
 
     def ranking(self) -> list[str]:
         """Return the methods' names, the one that catches most light first."""
@@ -141,6 +145,7 @@ class Track:
             "heliostats": len(self.heliostat_ids),
             "days": list(self.dates),
             "seed": int(self.settings["seed"]),
+            "iq": [dict(each) for each in self.iq],
             "ranking": self.ranking(),
             "methods": {
                 name: dict(method.summary) | ({"field_control": list(method.happened)} if method.happened else {})
@@ -149,8 +154,8 @@ class Track:
         }
 
 
-def track_of(simulation: Simulation, settings: Mapping[str, str]) -> Track:
-    """Gather what a finished simulation found."""
+def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequence[IqCheck] = ()) -> Track:
+    """Gather what a finished simulation found, and what samples of some of its mirrors did."""
     field = simulation.field
     target = field.target[:, :3].copy()
     target[field.target[:, 3] > 0.0] = np.nan
@@ -177,6 +182,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str]) -> Track:
         day=read_only(simulation.stored_day),
         sun_enu=read_only(simulation.stored_sun_enu),
         methods=methods,
+        iq=tuple(_plain(each.as_dict()) for each in iq),
     )
 
 
@@ -206,7 +212,9 @@ def _plain(found: Mapping[str, Any]) -> dict[str, Any]:
             return [plain(item) for item in value]
         if isinstance(value, np.generic):
             value = value.item()
-        return None if value is None or not np.isfinite(value) else value
+        if value is None or isinstance(value, str):
+            return value
+        return None if not np.isfinite(value) else value
 
     result: dict[str, Any] = plain(found)
     return result
@@ -240,6 +248,7 @@ def write_track(track: Track, path: str | Path) -> None:
             ("time/sun_enu", "sun_enu"),
         ):
             _write(file, place, getattr(track, name), _FIELD[place])
+        file.create_dataset("iq", data=json.dumps(track.iq))
         file.attrs["methods"] = json.dumps(list(track.methods))
         for method in track.methods.values():
             group = file.create_group(f"method/{method.name}")
@@ -322,6 +331,7 @@ def _read(file: h5py.File, path: Path) -> Track:
         day=read_only(file["time/day"][()]),
         sun_enu=read_only(file["time/sun_enu"][()]),
         methods=methods,
+        iq=tuple(json.loads(file["iq"].asstr()[()])),
     )
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +15,39 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.timeline import days
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate_recording
 from rfpose.scenario import Scenario
 
-__all__ = ["IqComparison", "compare_with_iq"]
+__all__ = ["IqCheck", "IqComparison", "check_with_iq", "compare_with_iq"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IqCheck:
+    """One mirror's normals from samples beside what the tracking's radio model says of them.
+
+    Attributes
+    ----------
+    heliostat, postures, solved
+        Whose, how many, and how many gave a pose.
+    error_rms_mrad, model_rms_mrad
+        Errors from the samples, and noise by the model, both angles of the normal.
+    variance_ratio
+        Squared errors over the model's covariance; one if the model holds.
+    """
+
+    heliostat: str
+    postures: int
+    solved: int
+    error_rms_mrad: float
+    model_rms_mrad: float
+    variance_ratio: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,6 +112,51 @@ def compare_with_iq(scenario: Scenario, *, heliostat: str, normal_enu: FloatArra
     return IqComparison(
         error_rad=error, spread_rad=errors.spread_rad, solved=np.asarray(result.poses.status[0] == PoseStatus.OK)
     )
+
+
+def check_with_iq(scenario: Scenario, heliostats: Sequence[str], *, seed: int, n_posture: int = 16) -> list[IqCheck]:
+    """Take chosen mirrors through the samples in postures of the run's first day; one frame of each posture.
+
+    Raises
+    ------
+    InvalidInputError
+        A mirror that the scenario does not have, or a field of dishes.
+    """
+    for name in heliostats:
+        if name not in scenario.heliostat_ids:
+            raise InvalidInputError(
+                f"samples can be made of the scenario's own mirrors only, not of {name!r}; it has "
+                f"{scenario.heliostat_ids[0]} to {scenario.heliostat_ids[-1]}"
+            )
+    if not heliostats:
+        return []
+    if scenario.tracking.collector != "heliostat":
+        raise InvalidInputError("samples are compared for heliostats; leave `check_iq` out for dishes")
+    day = days(scenario)[0]
+    at = np.flatnonzero(day.works)
+    sun = day.sun_enu[at[np.linspace(0, len(at) - 1, n_posture).astype(np.int64)]]
+    found = []
+    for i, name in enumerate(heliostats):
+        pivot = scenario.pivot_enu_m[scenario.heliostat_ids.index(name)]
+        normal = geometry.bisector_enu(np.asarray(scenario.site.aim_enu_m) - pivot, sun)
+        both = compare_with_iq(scenario, heliostat=name, normal_enu=normal, seed=seed + i)
+        good = both.solved
+        found.append(
+            IqCheck(
+                heliostat=name,
+                postures=n_posture,
+                solved=int(good.sum()),
+                error_rms_mrad=1e3 * _rms(both.error_rad[good]),
+                model_rms_mrad=1e3 * _rms(both.spread_rad[good]),
+                variance_ratio=0.5 * float(np.mean(both.chi2[good])) if good.any() else float("nan"),
+            )
+        )
+    return found
+
+
+def _rms(parts: FloatArray) -> float:
+    """Root of the mean squared length of vectors (row, part)."""
+    return float(np.sqrt(np.mean(np.sum(parts**2, axis=1)))) if len(parts) else float("nan")
 
 
 def _postures(scenario: Scenario, i_heliostat: int, normal_enu: FloatArray) -> Scenario:

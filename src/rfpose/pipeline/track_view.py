@@ -38,6 +38,7 @@ _ASTRAY = 0.25
 """Beams of other mirrors off the receiver are drawn if they pass the target within this part of their way."""
 _DAY_GAP_S = 3600.0
 """Between two simulated days the curves show a gap of this length, whatever lies between them."""
+_LOOKS_AT_SPOTS = 200
 _NAMED = 3
 """Of so many mirrors an event is told with their names."""
 
@@ -127,7 +128,8 @@ class TrackPicture:
     limit_mrad
         Error that the colours reach to: nearly all of the run lies below.
     spot_limit_m
-        How far from the aim point beams with that error pass [m]; NaN for dishes.
+        Within so much of the aim point, right or up, nearly all beams of mirrors on the receiver pass [m]; NaN for
+        dishes.
     """
 
     track: Track
@@ -269,8 +271,6 @@ def picture_of_track(track: Track) -> TrackPicture:
         error = np.abs(np.asarray(method.series["error_rad"], np.float64))
         known = error[np.isfinite(error)]
         limits[name] = max(1e3 * float(np.percentile(known, 98)), 1e-6) if known.size else 1.0
-    pivot, target = track.pivot_enu_m[track.stored], track.target_enu_m[track.stored]
-    farthest = _largest(np.linalg.norm(target - pivot, axis=1)) if len(pivot) else float("nan")
     return TrackPicture(
         track=track,
         methods=tuple(track.methods),
@@ -279,12 +279,31 @@ def picture_of_track(track: Track) -> TrackPicture:
         rms_mrad={name: 1e3 * np.asarray(m.series["rms_rad"], np.float64) for name, m in track.methods.items()},
         flux={name: np.asarray(m.series["flux"], np.float64) for name, m in track.methods.items()},
         happened={name: what_happened(track, name) for name in track.methods},
-        pivot_enu_m=pivot,
-        target_enu_m=target,
+        pivot_enu_m=track.pivot_enu_m[track.stored],
+        target_enu_m=track.target_enu_m[track.stored],
         ids=tuple(track.heliostat_ids[i] for i in track.stored),
         limit_mrad=limits,
-        spot_limit_m={name: 2e-3 * limit * farthest for name, limit in limits.items()},
+        spot_limit_m={name: _spot_limit_m(track, name) for name in track.methods},
     )
+
+
+def _spot_limit_m(track: Track, name: str) -> float:
+    """Return how far from the aim point beams pass, but for a few; from a part of the instants."""
+    series = track.methods[name].series
+    found = [np.empty(0)]
+    for k in range(0, len(track.unix_s), max(1, len(track.unix_s) // _LOOKS_AT_SPOTS)):
+        now = instant_at(
+            np.asarray(series["normal_enu"][k], np.float64),
+            np.asarray(series["error_rad"][k], np.float64),
+            track.sun_enu[k],
+            track.pivot_enu_m[track.stored],
+            track.target_enu_m[track.stored],
+            mode=np.asarray(series["mode"][k], np.int64),
+        )
+        found.append(np.abs(now.spot_m[now.on_receiver]).max(axis=1))
+    reach = np.concatenate(found)
+    reach = reach[np.isfinite(reach)]
+    return float(np.percentile(reach, 98)) if reach.size else float("nan")
 
 
 def mode_text(mode: int) -> str:
