@@ -10,7 +10,8 @@ mounts is propagated to first order, through the least squares with which the mo
 
 Left out: mirrors that pass the zenith; radio outages, clouds that blind a sun sensor; modes, messages and events of
 field control; the drives' top speed; errors of second order; what a quantised or loose drive does to the loop's gain;
-Berenguel's corrections that stop within their tolerance. With rare exceptions these only add.
+how the loop catches up with slow errors of the mount, which its integral leaves less than 0.01 mrad of; corrections of
+the zeros that stop within their tolerance; ground reflections in what radio teaches a model.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels as mount_kernels
+from rfpose.feedback.calibrated import PARAMETER_SETS
 from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.energy import combine_errors_rad, energy, representative_days
 from rfpose.feedback.mount import PARAMETERS, aim_rows
@@ -34,11 +36,11 @@ from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import Field, draw_field
 from rfpose.feedback.tracking.instruments import _LARGE, _PRIORS, _TURNS, _WORMS, LEARNED, Workshop
+from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS, Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.timeline import Day, days, hour_of_day, site_of
 from rfpose.feedback.tracking.wind import Gusts
-from rfpose.feedback.calibrated import PARAMETER_SETS
 from rfpose.scenario import Scenario
 
 __all__ = ["Budget", "SampledLoop", "mean_intercept", "track_budget"]
@@ -68,7 +70,7 @@ class SampledLoop:
     gain_per_s, integral_gain_per_s2
         K0, K1.
     interval_s, latency_s
-        Between measurements, and from one to the step in which it acts; at least a servo step, rounded up to whole ones.
+        Between measurements, and from one to the step in which it acts; in whole servo steps, at least one.
     servo_s
         Between servo steps, at which errors count.
     lost
@@ -82,6 +84,12 @@ class SampledLoop:
     servo_s: float = 1.0
     lost: float = 0.0
 
+    def __post_init__(self) -> None:
+        as_positive("interval_s", self.interval_s)
+        as_positive("servo_s", self.servo_s)
+        if not 0.0 <= self.lost <= 1.0:
+            raise InvalidInputError(f"`lost` must be a part, 0 to 1, got {self.lost}")
+
     def _shape(self) -> tuple[int, int]:
         """Return servo steps between measurements, and from one to where it acts."""
         late = max(int(np.ceil(self.latency_s / self.servo_s - 1e-9)), 1)
@@ -93,7 +101,9 @@ class SampledLoop:
         interval, here = self.interval_s, 1.0 - self.lost
         # the loop takes away all that stands still
         z = np.exp(2j * np.pi * np.maximum(np.abs(frequency_hz), 1e-9) * interval)
-        forward = here * interval * (self.gain_per_s + self.integral_gain_per_s2 * interval * z / (z - 1.0)) * z / (z - 1.0)
+        forward = (
+            here * interval * (self.gain_per_s + self.integral_gain_per_s2 * interval * z / (z - 1.0)) * z / (z - 1.0)
+        )
         return np.asarray(forward / (1.0 + forward * z ** -float(-(-late // n))), np.complex128)
 
     def left(self, frequency_hz: npt.ArrayLike) -> FloatArray:
@@ -175,6 +185,9 @@ class Budget:
         What is left of the morning's error when scoring begins.
     intercept
         Light caught by errors that scatter by the total over √2 in each direction.
+    posture_intercept
+        The same with each mirror's own rms at each time, weighted by the light there: where errors differ much from
+        posture to posture, as after a correction of the zeros, it is the truer one.
     perfect_intercept
         The same of a perfect tracker; below one for a dish.
     offered_kwh_per_m2, offered_kwh_per_m2_year
@@ -206,6 +219,7 @@ class Budget:
     fit_rad: float = 0.0
     start_rad: float = 0.0
     intercept: float = 1.0
+    posture_intercept: float = 1.0
     perfect_intercept: float = 1.0
     offered_kwh_per_m2: float = 0.0
     offered_kwh_per_m2_year: float = 0.0
@@ -238,6 +252,7 @@ class Budget:
             "parts_mrad": {name: 1e3 * value for name, value in self.parts_rad.items() if value > 0.0},
             "total_mrad": 1e3 * self.total_rad,
             "intercept": self.intercept,
+            "posture_intercept": self.posture_intercept,
             "perfect_intercept": self.perfect_intercept,
             "offered_kwh_per_m2": self.offered_kwh_per_m2,
             "lost_kwh_per_m2": self.lost_kwh_per_m2,
@@ -335,6 +350,8 @@ class _Budgeter:
         self._dish = plan.collector == "dish"
         self._radio: RadioModel | None = None
         if method.radio:
+            if not check_gains(scenario).stable:
+                raise InvalidInputError("[tracking.radio] these gains oscillate: no budget tells how far; lower them")
             noon = every[0].sun_enu[int(np.argmax(every[0].sun_enu[:, 2]))]
             self._radio = RadioModel(scenario, self._field.pivot_enu_m, usual_normal_enu=self._wanted(noon[None])[:, 0])
         self._workshop = Workshop(scenario, self._field, self._radio, self._gusts, seed=0)
@@ -364,17 +381,19 @@ class _Budgeter:
     def budget(self) -> Budget:
         """Return the budget: parts are averaged over days, mirrors and times."""
         squares: list[dict[str, float]] = []
+        table = capture_table(self._scenario)
+        light = np.zeros(2)
         for day in self._days:
             self._square = {}
-            self._of_day(day)
+            light += self._of_day(day, table)
             squares.append({name: float(np.nanmean(value)) for name, value in self._square.items()})
         parts = {f"{name}_rad": float(np.sqrt(np.mean([s[name] for s in squares]))) for name in squares[0]}
         found = Budget(method=self._method.name, **parts)
-        table = capture_table(self._scenario)
         day_kwh, year_kwh = self._offered_kwh()
         return dataclasses.replace(
             found,
             intercept=float(mean_intercept(table, found.total_rad)),
+            posture_intercept=float(light[0] / light[1]),
             perfect_intercept=float(table[0]),
             offered_kwh_per_m2=day_kwh,
             offered_kwh_per_m2_year=year_kwh,
@@ -383,8 +402,11 @@ class _Budgeter:
     def _add(self, part: str, square: npt.ArrayLike) -> None:
         self._square[part] = self._square.get(part, np.zeros(())) + np.asarray(square)
 
-    def _of_day(self, day: Day) -> None:
-        scored = np.flatnonzero(day.works & (np.arange(len(day.unix_s)) * self._plan.servo_interval_s >= self._plan.settle_s))
+    def _of_day(self, day: Day, table: FloatArray) -> FloatArray:
+        """Collect a day's squares by part (mirror, time), or what broadcasts to it; return light caught and offered."""
+        scored = np.flatnonzero(
+            day.works & (np.arange(len(day.unix_s)) * self._plan.servo_interval_s >= self._plan.settle_s)
+        )
         if not scored.size:
             scored = np.arange(len(day.unix_s))
         at = scored[np.linspace(0, len(scored) - 1, min(_N_TIME, len(scored))).astype(np.int64)]
@@ -398,6 +420,12 @@ class _Budgeter:
         if self._method.feedback == _kernels.SUN_SENSOR:
             self._of_sensor(course)
         self._of_model(day, course, speed, span_s)
+        shape = course.count.shape[:2]
+        total = np.sqrt(sum((np.broadcast_to(value, shape) for value in self._square.values()), np.zeros(shape)))
+        power = day.power_w_per_m2[at] * np.sum(course.normal_enu * course.sun_enu, axis=-1)
+        power = np.where(np.isfinite(total), power, 0.0)
+        caught = mean_intercept(table, np.nan_to_num(total))
+        return np.array([np.sum(power * caught), np.sum(power)])
 
     # -- where mirrors stand ---------------------------------------------------------------------------------
 
@@ -456,7 +484,7 @@ class _Budgeter:
     # -- drives ----------------------------------------------------------------------------------------------
 
     def _of_drive(self, course: _Course, speed: FloatArray) -> None:
-        drive, servo = self._plan.drive, self._plan.servo_interval_s
+        drive = self._plan.drive
         cosine = course.axes[2]
         # teeth of the error: so wide, about a middle that lags behind
         wait = max(drive.dead_band_steps / drive.microsteps, 0.5) if drive.dead_band_steps > 0.0 else 0.5
@@ -466,7 +494,7 @@ class _Budgeter:
         lines = _HARMONICS**-2.0 / np.sum(_HARMONICS**-2.0)
         for axis, across in enumerate((cosine, np.ones_like(cosine))):
             tooth_hz = per_s[..., axis, None] / width * _HARMONICS
-            left = self._left(tooth_hz)
+            left = self._hunting(self._left(tooth_hz))
             self._add("motor_steps", across**2 * width**2 / 12.0 * (left @ lines))
             if self._gusts.swings:
                 self._add("motor_swing", across**2 * width**2 / 12.0 * ((left * self._stirred(tooth_hz)) @ lines))
@@ -474,8 +502,17 @@ class _Budgeter:
             self._add("play", across**2 * self._of_play(slow, per_s[..., axis], speed[..., axis]))
             stuck = 1e-3 * drive.stiction_mrad[axis]
             if stuck > 0.0:
-                self._add("stiction", across**2 * stuck**2 / 12.0 * (self._left(per_s[..., axis, None] / stuck * _HARMONICS) @ lines))
-        del servo
+                left = self._hunting(self._left(per_s[..., axis, None] / stuck * _HARMONICS))
+                self._add("stiction", across**2 * stuck**2 / 12.0 * (left @ lines))
+
+    @staticmethod
+    def _hunting(left: FloatArray) -> FloatArray:
+        """Return the square of what is left of teeth that feedback cannot take away, though it sees them.
+
+        It goes to and fro between two steps, the mean being right: φ(1 − φ) of a step squared, on the average over φ
+        twice the tooth's own 1/12. Teeth too quick for it pass as they are.
+        """
+        return np.asarray(left + 2.0 * np.maximum(1.0 - left, 0.0))
 
     def _of_play(self, slow_rad: float, per_s: FloatArray, speed: FloatArray) -> FloatArray:
         """Return what an offset that goes with the axis' direction leaves: feedback finds it but after each turn."""
@@ -542,15 +579,15 @@ class _Budgeter:
             right.append(spread[:, 0] ** 2)
             up.append(spread[:, 1] ** 2 + spread[:, 2] ** 2)
             offset.append(errors.bias_rad**2)
-        return np.nanmean(right, axis=0), np.nanmean(up, axis=0), np.mean(offset, axis=0)
+        return _mean_known(right), _mean_known(up), np.mean(offset, axis=0)
 
     def _of_radio(self, course: _Course) -> None:
         assert self._loop is not None
         right, up, offset = self._radio_square(course)
-        self._add("radio_noise", (right + up) * self._loop.passed**2)
-        self._add("reflection", offset.sum(axis=-1))
-        self._add("plate", self._plate_square().sum(axis=-1))
-        self._add("plate_drift", self._plate_drift(course) ** 2)
+        self._add("radio_noise", (right + up)[:, None] * self._loop.passed**2)
+        self._add("reflection", offset.sum(axis=-1)[:, None])
+        self._add("plate", self._plate_square().sum(axis=-1)[:, None])
+        self._add("plate_drift", self._plate_drift(course)[None] ** 2)
 
     def _plate_looks(self) -> tuple[int, int]:
         """Return the day and number of looks with which the camera finds the plate."""
@@ -580,10 +617,12 @@ class _Budgeter:
     def _of_sensor(self, course: _Course) -> None:
         assert self._loop is not None
         sensor = self._plan.sun_sensor
-        level = 2e-3 * sensor.range_mrad / sensor.levels
+        level, servo = 2e-3 * sensor.range_mrad / sensor.levels, self._plan.servo_interval_s
         self._add("sensor_null", 2.0 * (1e-3 * sensor.offset_sigma_mrad) ** 2)
-        self._add("sensor_drift", 2.0 * (0.5e-3 * sensor.drift_mrad * course.heat) ** 2)
-        self._add("sensor_levels", 2.0 * (level / np.sqrt(12.0) * self._loop.passed) ** 2)
+        self._add("sensor_drift", 2.0 * (0.5e-3 * sensor.drift_mrad * course.heat[None]) ** 2)
+        # about zero the innermost levels are a relay: to and fro by what half a level moves the mirror in a step
+        moved = servo * (sensor.gain_per_s + 0.5 * servo * sensor.integral_gain_per_s2) * 0.5 * level
+        self._add("sensor_levels", moved**2)
 
     # -- what is not known of the mounts ---------------------------------------------------------------------
 
@@ -602,7 +641,7 @@ class _Budgeter:
         return np.asarray(np.maximum(0.5e-3 * self._plan.camera.spot_sigma_mm / distance, 1e-6))
 
     def _sigmas(self) -> dict[str, float]:
-        """Standard deviation of each parameter of the mounts as built; a fixed one counts with all of its value."""
+        """Return the standard deviation of each parameter as built; a fixed one counts with all of its value."""
         e = self._plan.mount_errors
         worm = 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0)
         sigma = {
@@ -611,10 +650,13 @@ class _Budgeter:
             "nonorthogonality_rad": 1e-3 * e.nonorthogonality_sigma_mrad,
             "canting_up_rad": 1e-3 * e.canting_sigma_mrad, "canting_right_rad": 1e-3 * e.canting_sigma_mrad,
             "gravity_sag_rad": 1e-3 * e.sag_sigma_mrad,
-            **{name: 1e-3 * e.location_sigma_mm for name in _PLACE},
-            **{name: worm for name in _WORMS},
+            **dict.fromkeys(_PLACE, 0.001 * e.location_sigma_mm),
+            **dict.fromkeys(_WORMS, worm),
         }  # fmt: skip
-        return sigma | {name: abs(value) for name, value in e.fixed.items()}
+        nominal = self._field.nominal[0]
+        fixed = {name: abs(value - float(nominal[_INDEX[name]])) for name, value in e.fixed.items()}
+        # the receivers' plane is drawn apart
+        return sigma | {name: value for name, value in fixed.items() if not name.startswith("receiver_plane")}
 
     def _of_model(self, day: Day, course: _Course, speed: FloatArray, span_s: float) -> None:
         """Add what the model does not know, or of closed loops what they cannot see."""
@@ -622,8 +664,7 @@ class _Budgeter:
         self._of_knowledge(day, course, speed)
         if self._loop is None:
             return
-        open_loop = {name: value - before.get(name, 0.0) for name, value in self._square.items()}
-        open_loop = {name: float(np.mean(value)) for name, value in open_loop.items() if np.any(value != 0.0)}
+        morning = sum(float(np.nanmean(value - before.get(name, 0.0))) for name, value in self._square.items())
         if self._method.feedback == _kernels.ENCODER:
             self._square["worm"] = self._of_worm(course, speed)
             level = 2.0 * np.pi / 2**self._plan.encoder.bits
@@ -634,8 +675,7 @@ class _Budgeter:
         self._square = before
         self._add("place", self._of_place(course))
         self._add("worm", self._of_worm(course, speed))
-        first = sum(open_loop.values())
-        self._add("start", first * self._loop.start_rms(self._plan.settle_s, span_s) ** 2)
+        self._add("start", morning * self._loop.start_rms(self._plan.settle_s, span_s) ** 2)
 
     def _of_place(self, course: _Course) -> FloatArray:
         sigma = self._sigmas()
@@ -682,7 +722,8 @@ class _Budgeter:
 
     def _centred(self, day: Day, course: _Course, speed: FloatArray, looks: _Course, since: int) -> None:
         """As `_propagate` for both zeros from one look, each mirror at a time of its own; mean over these times."""
-        kept, total = self._square, {}
+        kept: dict[str, FloatArray] = self._square
+        total: dict[str, FloatArray] = {}
         for i in range(looks.count.shape[1]):
             self._square = {}
             one = _Course(
@@ -709,8 +750,10 @@ class _Budgeter:
         for source in self._sources(day, course, looks, since):
             error = np.zeros((*course.count.shape[:2], 3)) if source.track is None else source.track
             if gain is not None and known is not None and source.look is not None:
-                error = error - np.einsum("mtxf,mflx,mly->mtx", known, gain, source.look[..., :, :]) if False else (
-                    error - np.einsum("mtxf,mf->mtx", known, np.einsum("mfly,mly->mf", gain, source.look))
+                error = (
+                    error - np.einsum("mtxf,mflx,mly->mtx", known, gain, source.look[..., :, :])
+                    if False
+                    else (error - np.einsum("mtxf,mf->mtx", known, np.einsum("mfly,mly->mf", gain, source.look)))
                 )
             self._add(source.part, np.where(course.seen, np.sum(error**2, axis=-1), np.nan))
         if gain is not None and looks is not None and known is not None:
@@ -770,7 +813,7 @@ class _Budgeter:
     def _sources(self, day: Day, course: _Course, looks: _Course | None, since: int | None) -> list[_Source]:
         """Return all that makes mirrors point elsewhere than the model has it."""
         found = self._mount_sources(day, course, looks, since)
-        right, up, cosine = course.axes
+        right, up, _ = course.axes
         steady = self._gusts.mean_mps**2 * self._gusts.bend
         at_look = None if looks is None else looks.axes
         for a, direction in enumerate((right, up)):
@@ -831,6 +874,12 @@ class _Budgeter:
         times = representative_days(self._site, self._plan.date.year, 12)
         year = energy(self._site, times, target_enu=towards, min_elevation_rad=low)
         return total / 3.6e6, float(np.mean(year.offered_j_m2)) * 365.25 / 12.0 / 3.6e6
+
+
+def _mean_known(values: list[FloatArray]) -> FloatArray:
+    """Return the mean over the first axis of what is no NaN; nothing known: zero."""
+    known = np.isfinite(values)
+    return np.asarray(np.sum(np.nan_to_num(values), axis=0) / np.maximum(known.sum(axis=0), 1))
 
 
 def _part_of(whole: Field, some: npt.NDArray[np.int64]) -> Field:
