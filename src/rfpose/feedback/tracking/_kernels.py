@@ -123,6 +123,14 @@ def _carried(heard, angle, loop, out):
 
 
 @kernel
+def _flatten(n, v):
+    """Take from a vector what lies along a normal."""
+    along = n[0] * v[0] + n[1] * v[1] + n[2] * v[2]
+    for i in range(3):
+        v[i] -= along * n[i]
+
+
+@kernel
 def _off(row, posture, wanted):
     """Angle between a normal and the one that the row wants from this mirror centre."""
     _bisector(row, posture[3:], wanted)
@@ -276,7 +284,6 @@ def _track(
     seen, across, counts = scratch[56:59], scratch[59:61], scratch[61:63]
     row, receiver, aside = scratch[64:74], scratch[74:84], scratch[84:94]
     work = scratch[94:112].reshape(3, 6)
-    guess[:] = 1.0
     row[:] = 0.0
     aside[:] = 0.0
     is_dish = target[3] > 0.5
@@ -349,19 +356,26 @@ def _track(
             used = entry[0] == USED and duty == TRACK
             state[SILENT] = state[SILENT] + 1.0 if entry[0] == LOST else 0.0
             if used:
-                busy = False
+                busy = state[UNREACHABLE] > 0.0
                 for a in range(2):
                     busy = busy or abs(state[COMMAND + a] - state[MOTOR + a]) > drive_1.speed
                 if loop.feedback == ENCODER:
                     for a in range(2 if not busy else 0):
                         state[SLIP + a] += seconds * law.gain * entry[1 + a]
-                elif not busy:  # a motor that runs flat out is on its way: nothing winds up meanwhile
+                elif not busy:  # out of reach, or with a motor flat out on its way: nothing winds up meanwhile
+                    _posture(
+                        _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model,
+                        known, 0.0, guess,
+                    )  # fmt: skip
                     for i in range(3):
                         speed, state[RAMP + i] = law_step(entry[1 + i], state[RAMP + i], law, seconds)
                         change[i] = state[SHIFT + i]
                         moved = change[i] + seconds * speed
                         state[SHIFT + i] = min(max(moved, -_LIMIT_RAD), _LIMIT_RAD)
                         change[i] = state[SHIFT + i] - change[i]
+                    # along the normal a shift turns nothing, and nothing would hold it
+                    _flatten(guess, state[SHIFT : SHIFT + 3])
+                    _flatten(guess, state[RAMP : RAMP + 3])
                     # at once, to first order; exact from the next command on
                     h = _across(guess, change, across)
                     for a in range(2):
@@ -516,7 +530,9 @@ def _track(
         if not tick or loop.feedback == NO_FEEDBACK:
             continue
         entry = ring[(g // loop.interval) % N_RING]
-        entry[0] = HEARD if duty == GO else USED
+        # flat out a mirror is somewhere on its way: that is nothing to steer by or to learn from
+        slewing = abs(state[MOVED]) >= 0.999 * drive_1.speed or abs(state[MOVED + 1]) >= 0.999 * drive_2.speed
+        entry[0] = HEARD if duty == GO or slewing else USED
         _posture(
             _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known, 0.0,
             guess,
