@@ -2,6 +2,7 @@
 
 tracking_day.png    the methods over a day of the shipped scenario, and mirror by mirror
 tracking_outage.png what an hour and a half without radio does
+tracking_events.png a day on which step counts, a cluster and power are lost, and an emergency is called
 """
 
 from __future__ import annotations
@@ -22,6 +23,17 @@ from rfpose.scenario import load_scenario
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "data" / "tracking_100m.toml"
 OUTAGE = (10.5, 12.0)
+EVENTS = (
+    {"hour": 9.5, "what": "counts-lost", "heliostats": ("H03",)},
+    {"hour": 9.6, "what": "zero-counts", "heliostats": ("H03",)},
+    {"hour": 10.0, "what": "calibrate", "heliostats": ("H03",)},
+    {"hour": 11.5, "what": "emergency"},
+    {"hour": 12.0, "what": "release"},
+    {"hour": 13.0, "what": "cluster-fails", "cluster": 0},
+    {"hour": 13.1, "what": "cluster-returns", "cluster": 0},
+    {"hour": 14.5, "what": "power-fails", "heliostats": ("H05", "H06")},
+    {"hour": 14.8, "what": "power-returns", "heliostats": ("H05", "H06")},
+)
 
 
 def draw_outage(path: Path) -> None:
@@ -51,12 +63,15 @@ def draw_outage(path: Path) -> None:
 
 
 def main() -> None:
-    """Draw both."""
+    """Draw all."""
     directory = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         found = track(SCENARIO, Path(temporary) / "day.h5")
+        methods = ("camera-model", "radio-both")
+        eventful = track(SCENARIO, Path(temporary) / "events.h5", methods=methods, events=EVENTS)
     draw_track(found, directory / "tracking_day.png")
+    draw_track(eventful, directory / "tracking_events.png")
     draw_outage(directory / "tracking_outage.png")
 
 
