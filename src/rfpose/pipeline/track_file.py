@@ -18,6 +18,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import RecordingError, ScenarioError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
+from rfpose.feedback.tracking.budget import track_budget
 from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.scenario import Scenario, parse_scenario
@@ -167,7 +168,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequenc
             text=method.text,
             series={name: getattr(curves, name) for name in _SERIES},
             scores={name: getattr(found, name) for name in _SCORES},
-            summary=_plain(found.as_dict() | _over_the_year(simulation, found)),
+            summary=_plain(found.as_dict() | _over_the_year(simulation, found) | _foreseen(simulation, method.name)),
             happened=tuple(simulation.happened(method.name)),
         )
     return Track(
@@ -184,6 +185,13 @@ def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequenc
         methods=methods,
         iq=tuple(_plain(each.as_dict()) for each in iq),
     )
+
+
+def _foreseen(simulation: Simulation, method: str) -> dict[str, Any]:
+    """Return the error budget of a method, which knows nothing of the simulation."""
+    budget = track_budget(simulation.scenario, method, count=len(simulation.field)).as_dict()
+    del budget["method"]
+    return {"budget": budget}
 
 
 def _over_the_year(simulation: Simulation, found: Score) -> dict[str, Any]:
