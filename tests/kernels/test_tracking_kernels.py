@@ -28,6 +28,26 @@ for collector, methods in (("heliostat", ("open-loop", "encoder", "radio-both"))
         simulation.advance()
     for name, values in simulation.state().items():
         found[f"{collector}/{name}"] = values
+# orders: a defocus, an emergency, mirrors that swing and carry the sun on, or hold it
+for between in ("carried-on", "held"):
+    data = base.model_dump(exclude_none=True)
+    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "store_interval_s": 4.0}
+    data["tracking"]["drive"] |= {"speed_mradps": 200.0}
+    data["tracking"]["field_control"] |= {"between_messages": between, "emergency_hold_s": 8.0}
+    data["tracking"]["structure"] = {"natural_hz": 2.2, "damping": 0.05}
+    data["tracking"]["radio"] |= {"ground": "none", "plate_calibration": "none"}
+    data["tracking"]["event"] = [
+        {"hour": 9.008, "what": "defocus", "heliostats": ("H02",)},
+        {"hour": 9.016, "what": "emergency"}, {"hour": 9.028, "what": "release"},
+    ]
+    simulation = Simulation(type(base).model_validate(data), methods=("open-loop", "radio"), count=2, seed=4)
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+    modes = simulation.curves("radio").mode
+    assert {0, 1, 2, 4, 7, 8} <= set(modes.ravel().tolist()), modes
+    for name, values in simulation.state().items():
+        if values.dtype.kind in "fib":
+            found[f"{between}/{name}"] = values
 np.savez(sys.argv[2], **found)
 """
 

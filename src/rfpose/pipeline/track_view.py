@@ -193,23 +193,22 @@ class TrackPicture:
         return f"{text}, error {now.error_mrad[row]:.3g} mrad of the normal"
 
     def comparison(self, instant: int) -> list[tuple[str, float, float, float, float, float, float]]:
-        """Return rows of method, error now, rms, 95 %, worst [mrad of the normal], intercept, availability.
+        """Return rows of method, error now, rms, worst mirror's 95 %, worst [mrad], intercept, availability.
 
-        The best is first.
+        The best is first; milliradians are of the normal.
         """
         rows = []
         for name in self.track.ranking():
-            scores = self.track.methods[name].scores
-            rms = scores["heliostat_rms_rad"]
+            method = self.track.methods[name]
             rows.append(
                 (
                     name,
                     float(self.rms_mrad[name][instant]) if self.n_instant else float("nan"),
-                    1e3 * float(np.sqrt(np.nanmean(np.square(rms)))) if np.isfinite(rms).any() else float("nan"),
-                    1e3 * _largest(scores["heliostat_p95_rad"]),
-                    1e3 * _largest(scores["heliostat_worst_rad"]),
-                    _mean(scores["heliostat_intercept"]),
-                    _number(self.track.methods[name].summary.get("availability")),
+                    _number(method.summary["normal_mrad"]["rms"]),
+                    1e3 * _largest(method.scores["heliostat_p95_rad"]),
+                    1e3 * _largest(method.scores["heliostat_worst_rad"]),
+                    _number(method.summary["intercept"]),
+                    _number(method.summary["availability"]),
                 )
             )
         return rows
@@ -252,10 +251,6 @@ def instant_at(
 
 def _largest(values: FloatArray) -> float:
     return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
-
-
-def _mean(values: FloatArray) -> float:
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
 
 def _number(value: Any) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import platform
+import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfpose import __version__
@@ -13,6 +16,9 @@ from rfpose.errors import RfposeError
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_summary import summarise
+from rfpose.pipeline.track_file import Track
+from rfpose.pipeline.track_pictures import draw_track
+from rfpose.pipeline.track_view import MODES, ON_RECEIVER, TrackPicture, clock
 from rfpose.recording import describe
 from rfpose.viewer.export import picture_tag
 from rfpose.viewer.views.field import COLOURS, FieldView
@@ -34,6 +40,10 @@ p.m { color: #5d6670; }
 """
 _PACKAGES = ("numpy", "scipy", "numba", "h5py", "pyqtgraph", "PySide6-Essentials")
 _MAX_ROWS = 500
+_COMPARED = (
+    "Errors of the normal, of mirrors on the receiver. Caught: part of a perfect tracker's light, while on the "
+    "receiver. Available: light caught over light offered in all modes. Off the receiver: hours of a mirror, all days."
+)
 
 
 def report_html(app: QApplication, window: MainWindow) -> str:
@@ -44,11 +54,17 @@ def report_html(app: QApplication, window: MainWindow) -> str:
     parts += [f"<p>{_text(note)}</p>" for note in document.notes]
     if document.result is not None:
         parts += _result_tables(document.result)
+    elif document.track is not None:
+        parts += _track_tables(document.track)
+        window.session.playback.scrub(window.session.playback.frame or document.track.n_instant // 2)
     elif document.recording is not None:
         parts += ["<h2>Recording</h2>", _facts(describe(document.recording))]
     parts += _pictures(app, window)
-    if document.result is not None:
-        parts += ["<h2>Settings</h2>", _facts(document.result.settings)]
+    settings = document.result.settings if document.result is not None else None
+    if document.track is not None:
+        settings = document.track.track.settings
+    if settings is not None:
+        parts += ["<h2>Settings</h2>", _facts(settings)]
     parts += ["<h2>Versions</h2>", _facts(_versions())]
     if document.scenario is not None:
         text = _text(document.scenario.to_toml())
@@ -123,6 +139,80 @@ def _result_tables(result: Result) -> list[str]:
     if len(evaluation.heliostats) > _MAX_ROWS:
         parts.append(f'<p class="m">and {len(evaluation.heliostats) - _MAX_ROWS} heliostats more.</p>')
     return parts
+
+
+def _track_tables(picture: TrackPicture) -> list[str]:
+    track = picture.track
+    facts = {"heliostats": len(track.heliostat_ids), "days": track.dates, "instants": picture.n_instant}
+    parts = ["<h2>What was tracked</h2>", _facts(facts), "<h2>How the methods compare</h2>"]
+    header = ("method", "error rms [mrad]", "95 %", "worst", "light caught", "available", "kWh/m²", "off the receiver")
+    rows = []
+    for name in track.ranking():
+        summary = track.methods[name].summary
+        normal, modes = summary["normal_mrad"], summary["modes"]
+        away = sum(mode["hours"] for key, mode in modes.items() if MODES.index(key) not in ON_RECEIVER)
+        rows.append(
+            [
+                name,
+                *(_number(normal[key], ".3g") for key in ("rms", "p95", "worst")),
+                *(_number(summary[key], ".2%") for key in ("intercept", "availability")),
+                _number(summary["energy_kwh_per_m2"], ".3f"),
+                f"{away:.2f} h",
+            ]
+        )
+    parts += [_table(header, rows), f'<p class="m">{_text(_COMPARED)}</p>']
+    if picture.under_field_control:
+        parts += ["<h2>What happened</h2>", _words(("day", "solar time", "what", "methods"), _story(picture))]
+        parts += ["<h2>Time and light by mode</h2>", _table(*_by_mode(track))]
+    return [*parts, "<h2>The first day</h2>", _drawn(track)]
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form).replace("%", " %")
+
+
+def _story(picture: TrackPicture) -> list[list[str]]:
+    """Return rows of what happened, the same thing once for all methods that met it."""
+    methods: dict[tuple[int, str, str], list[str]] = {}
+    order = {}
+    for name in picture.track.ranking():
+        for each in picture.happened[name]:
+            key = (each.day, clock(each.hour), each.text)
+            methods.setdefault(key, []).append(name)
+            order[key] = (each.day, not key[1], each.hour if key[1] else 0.0)
+    rows = []
+    for key in sorted(methods, key=lambda key: order[key])[:_MAX_ROWS]:
+        names = methods[key]
+        met = "all" if len(names) == len(picture.methods) else ", ".join(names)
+        rows.append([picture.track.dates[key[0]], key[1], key[2], met])
+    if len(methods) > _MAX_ROWS:
+        rows.append(["", "", f"and {len(methods) - _MAX_ROWS} things more", ""])
+    return rows
+
+
+def _by_mode(track: Track) -> tuple[list[str], list[list[str]]]:
+    """Return minutes of a mirror in each mode and the light that is lost there, by method."""
+    known = [key for key in MODES if any(key in method.summary["modes"] for method in track.methods.values())]
+    rows = []
+    for name in track.ranking():
+        modes = track.methods[name].summary["modes"]
+        cells = [modes.get(key) for key in known]
+        rows.append([f"{name} [min]", *("–" if cell is None else f"{60.0 * cell['hours']:.1f}" for cell in cells)])
+        lost = ("–" if cell is None else f"{cell['lost_kwh_per_m2']:.3f}" for cell in cells)
+        rows.append([f"{name}, lost [kWh/m²]", *lost])
+    return ["a mirror, all days", *(key.replace("_", " ") for key in known)], rows
+
+
+def _drawn(track: Track) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "track.png"
+        draw_track(track, path)
+        return f'<img alt="" src="data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}">'
+
+
+def _words(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of text, where nothing is set to the right."""
+    return _table(header, rows).replace("<td class=n>", "<td>")
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

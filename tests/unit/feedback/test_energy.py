@@ -6,6 +6,7 @@ from rfpose.feedback.energy import (
     clear_beam_w_m2,
     combine_errors_rad,
     dish_capture,
+    dish_capture_at,
     draw_bursts,
     energy,
     heliostat_intercept,
@@ -43,6 +44,42 @@ def test_dish_capture_is_the_mean_of_a_wandering_image():
     aperture = np.sqrt(np.sin(np.pi / 3.0) ** 2 / area)
     caught = np.mean(np.hypot(*(spread * rng.standard_normal((2, 200_000)))) < aperture)
     assert dish_capture(area, h_per_deg=h, sigma_rad=sigma) == pytest.approx(caught, abs=0.004)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3e-3, 1e-3, 3e-3, 8e-3])
+@pytest.mark.parametrize(("h", "rim_deg", "area"), [(3.9, 60.0, 2000.0), (2.0, 45.0, 500.0)])
+def test_capture_at_an_error_averages_to_edwards(h, rim_deg, area, sigma):
+    # β²/2σ² of errors that scatter alike in two directions is exponential: Gauss-Laguerre
+    node, weight = np.polynomial.laguerre.laggauss(80)
+    rim = np.deg2rad(rim_deg)
+    mean = dish_capture_at(sigma * np.sqrt(2.0 * node), area, h_per_deg=h, rim_rad=rim) @ weight
+    assert mean == pytest.approx(dish_capture(area, h_per_deg=h, sigma_rad=sigma, rim_rad=rim), rel=1e-6)
+
+
+def test_capture_at_an_error_is_what_of_an_image_beside_falls_in():
+    h, area, rng, n = 3.9, 2000.0, np.random.default_rng(4), 200_000
+    spread = np.deg2rad(1.0) / (h * np.sqrt(2.0))
+    aperture = np.sin(np.pi / 3.0) / np.sqrt(area)
+    image = spread * rng.standard_normal((2, n))
+    for error in (0.0, 2e-3, 6e-3):
+        caught = np.mean(np.hypot(image[0] + error, image[1]) < aperture)
+        scatter = np.sqrt(caught * (1.0 - caught) / n)
+        assert dish_capture_at(error, area, h_per_deg=h) == pytest.approx(caught, abs=4.0 * scatter)
+    falling = dish_capture_at(np.linspace(0.0, 30e-3, 100), area, h_per_deg=h)
+    assert np.all(np.diff(falling) < 0.0)
+    with pytest.raises(InvalidInputError, match="area_ratio"):
+        dish_capture_at(0.0, 0.0, h_per_deg=h)
+
+
+@pytest.mark.parametrize("ratio", [0.4, 1.0, 1.7])
+def test_two_discs_overlap_as_points_in_them_do(ratio):
+    rng, n = np.random.default_rng(5), 100_000
+    radius = 0.5 * 9.3e-3 + 1.5e-3
+    at, turn = radius * np.sqrt(rng.random(n)), 2.0 * np.pi * rng.random(n)
+    for error in (0.0, 0.3 * radius, abs(ratio - 1.0) * radius, radius, 1.3 * radius, (ratio + 1.01) * radius):
+        inside = np.mean(np.hypot(at * np.cos(turn) - error, at * np.sin(turn)) < ratio * radius)
+        got = intercept_ratio(error, aperture_ratio=ratio)
+        assert got == pytest.approx(inside, abs=4.0 * np.sqrt(max(inside * (1.0 - inside), 1e-5) / n))
 
 
 @pytest.mark.parametrize(("latitude", "expected"), [(-25.0, 13.6e9), (-35.0, 13.3e9)])

@@ -8,16 +8,21 @@ import pytest
 
 from rfpose import geometry
 from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback.energy import dish_capture_at, dish_efficiency
 from rfpose.feedback.mount import PARAMETERS
+from rfpose.feedback.optics import intercept_ratio
+from rfpose.feedback.structure import Structure
 from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking import METHODS, _kernels
+from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import draw_field, field_positions
-from rfpose.feedback.tracking.loops import check_gains, loop_margins
+from rfpose.feedback.tracking.loops import _swing, check_gains, loop_margins
 from rfpose.feedback.tracking.methods import choose
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.score import quantile
 from rfpose.feedback.tracking.timeline import days, site_of
 from rfpose.feedback.tracking.wind import Gusts
+from rfpose.feedback.wind.spectrum import wind_deflection
 from rfpose.layout.maps import ESTIMATORS, Estimator, mirrors_facing, noise_of, normal_map
 from rfpose.multilat.rigid import Knowledge, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
@@ -31,6 +36,9 @@ def changed(**tracking):
     scenario = load_scenario(DATA)
     data = scenario.model_dump(exclude_none=True)
     for key, value in tracking.items():
+        if value is None:
+            data["tracking"].pop(key, None)
+            continue
         old = data["tracking"].get(key)
         data["tracking"][key] = {**old, **value} if isinstance(old, dict) else value
     return type(scenario).model_validate(data)
@@ -83,7 +91,7 @@ def test_gains_without_margin_are_refused_unless_forced():
 
 
 def test_a_day_lasts_while_the_sun_is_high_enough():
-    scenario = load_scenario(DATA)
+    scenario = changed(field_control=None)
     (day,) = days(scenario)
     sun = sun_position(day.unix_s[::600], site_of(scenario))
     np.testing.assert_allclose(day.sun_enu[: len(day.unix_s) : 600], sun.direction_enu, atol=2e-7)
@@ -290,3 +298,96 @@ def test_contradictory_tracking_tables_are_refused(table, complaint):
     plain = load_scenario(ROOT / "data" / "table2_100m.toml").to_toml()
     with pytest.raises(ScenarioError, match=complaint):
         parse_scenario(f"{plain}\n[tracking]\n{table}\n")
+
+
+# ---- captures -----------------------------------------------------------------------------------------------------
+
+
+def looked_up(table, error):
+    per_rad = (N_CAPTURE - 1) / TOP_RAD
+    return np.array([_kernels._caught(e, table, per_rad) for e in error])
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 1.4])
+def test_a_heliostats_capture_is_that_of_its_aperture(ratio):
+    error = np.random.default_rng(1).uniform(0.0, 20e-3, 300)
+    got = looked_up(capture_table(changed(aperture={"image_ratio": ratio})), error)
+    want = intercept_ratio(error, slope_error_rad=1.5e-3, aperture_ratio=ratio)
+    # steps of 31 µrad on discs of 6.15 mrad; where one leaves the other the curve has a kink, and a root of the step:
+    # 31/6150 of 2/π at most by the slope
+    np.testing.assert_allclose(got, want, atol=2e-4)
+    assert looked_up(capture_table(changed(aperture={"image_ratio": ratio})), [0.0])[0] == min(1.0, ratio**2)
+
+
+@pytest.mark.parametrize("area", [None, 800.0, 3000.0])
+def test_a_dishs_capture_is_edwards_before_his_average(area):
+    aperture = {"h_per_deg": 3.0, "rim_deg": 50.0} | ({} if area is None else {"area_ratio": area})
+    site = changed(collector="dish", aperture=aperture)
+    rim = np.deg2rad(50.0)
+    ratio = area or float(dish_efficiency(h_per_deg=3.0, loss_w_m2=2e5, rim_rad=rim)[1])
+    error = np.random.default_rng(2).uniform(0.0, 30e-3, 300)
+    want = dish_capture_at(error, ratio, h_per_deg=3.0, rim_rad=rim)
+    np.testing.assert_allclose(looked_up(capture_table(site), error), want, atol=1e-5)
+    assert looked_up(capture_table(site), [TOP_RAD, 1.0, np.nan]).tolist() == [0.0, 0.0, 0.0]
+
+
+# ---- a sun that is carried on -------------------------------------------------------------------------------------
+
+
+def test_a_heard_sun_is_carried_on_as_the_sky_turns():
+    scenario = load_scenario(DATA)
+    (day,) = days(scenario)
+    site = site_of(scenario)
+    loop = _kernels.Loop(**dict.fromkeys(_kernels.Loop._fields, 0))._replace(
+        pole_n=np.cos(site.latitude_rad), pole_u=np.sin(site.latitude_rad)
+    )
+    out = np.empty(3)
+    for at in range(1000, 35_000, 3000):
+        _kernels._carried(day.sun_enu[at], 7.2921159e-5 * 60.0, loop, out)
+        # a minute of 4.4 mrad: the sun's own way among the stars is 1/365 of it, 12 µrad, and refraction's change
+        # at 10 degrees of height is 30 µrad a degree
+        assert np.linalg.norm(out - day.sun_enu[at + 60]) < 30e-6
+        assert np.linalg.norm(day.sun_enu[at + 60] - day.sun_enu[at]) > 4e-3
+        assert np.linalg.norm(out) == pytest.approx(1.0, abs=1e-9)
+
+
+# ---- structure ----------------------------------------------------------------------------------------------------
+
+
+def test_the_kernels_swing_has_the_winds_variance_and_rings_down():
+    gusts = Gusts(changed(structure={"natural_hz": 2.2, "damping": 0.02}, wind={"mean_speed_mps": 7.0}))
+    mode = Structure(natural_hz=2.2, damping=0.02)
+    want = [float(wind_deflection(b, 7.0, mode, size_m=2.0)[1]) for b in gusts.bend]
+    np.testing.assert_allclose(gusts.swing_sigma_rad**2, want, rtol=1e-12)
+    loop = _kernels.Loop(**dict.fromkeys(_kernels.Loop._fields, 0))._replace(servo_s=1.0, **_swing(gusts))
+    noise = gusts.draw_swing(np.random.default_rng(3), (200, 500))
+    state, seen = np.zeros((200, _kernels.N_STATE)), []
+    for s in range(500):
+        for i in range(200):
+            _kernels._swing(loop, noise[i, s], 0.0, 0.0, state[i])
+        seen.append(state[:, [_kernels.SWING, _kernels.SWING + 2]].copy())
+    late = np.array(seen)[60:]
+    # ringing lasts 3.6 s: of 88 000 samples some 25 000 are free; five sigma of their variance
+    np.testing.assert_allclose(np.mean(late**2, axis=(0, 1)), want, rtol=5.0 * np.sqrt(2.0 / 25_000.0))
+    assert gusts.variance_rad2 > np.mean(want)
+    # a motor that stops: free vibration from the speed that it took away
+    one, v = np.zeros(_kernels.N_STATE), 40e-3
+    one[_kernels.RATE] = v
+    w, still = mode.natural_radps, np.zeros(4)
+    wd = w * np.sqrt(1.0 - 0.02**2)
+    for t in range(1, 20):
+        _kernels._swing(loop, still, 0.0, 0.0, one)
+        expected = v / wd * np.exp(-0.02 * w * t) * np.sin(wd * t)
+        assert one[_kernels.SWING] == pytest.approx(expected, abs=1e-9 * v)
+        assert one[_kernels.SWING + 2] == 0.0
+
+
+def test_a_stiff_structure_draws_nothing_and_does_not_swing():
+    gusts = Gusts(changed(structure={"natural_hz": 0.0}))
+    assert not gusts.swings
+    assert gusts.draw_swing(np.random.default_rng(0), (3, 100)).shape == (3, 0, 4)
+    assert not gusts.swing_rad(np.random.default_rng(0), (3, 5)).any()
+    soft = Gusts(changed(structure={"natural_hz": 2.2}))
+    drawn = soft.swing_rad(np.random.default_rng(0), (20_000,))
+    # 0.7 % is the scatter of a standard deviation of so many
+    np.testing.assert_allclose(drawn.std(axis=0), soft.swing_sigma_rad, rtol=0.03)

@@ -3,7 +3,7 @@ import pytest
 from scipy import signal
 
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import Structure, swing_transition
 from rfpose.feedback.wind import (
     WindLoad,
     admittance,
@@ -62,6 +62,33 @@ def test_background_and_resonance_add_up_to_what_a_record_does():
     background, resonant = wind_deflection(1.0, 5.0, mode, size_m=3.0)
     assert np.var(moved[:, 2000:]) == pytest.approx(background + resonant, rel=0.12)
     assert bend.mean() > 25.0
+
+
+@pytest.mark.parametrize(("hz", "damping", "interval"), [(2.2, 0.02, 1.0), (0.6, 0.1, 1.0), (5.0, 0.3, 0.25)])
+def test_a_swing_is_that_of_the_mode_between_samples(hz, damping, interval):
+    mode = Structure(natural_hz=hz, damping=damping)
+    transition, root = swing_transition(mode, interval_s=interval)
+    w = mode.natural_radps
+    # stays as it is: deflection of variance one, speed of ω²
+    stationary = np.diag([1.0, w**2])
+    kept = transition @ stationary @ transition.T + root @ root.T
+    np.testing.assert_allclose(kept, stationary, rtol=1e-9, atol=1e-9 * w)
+    # the same ring-down as scipy's state space of the mode, sampled
+    a = np.array([[0.0, 1.0], [-(w**2), -2.0 * damping * w]])
+    system = signal.cont2discrete((a, np.zeros((2, 1)), np.eye(2), np.zeros((2, 1))), interval)
+    _, seen, _ = signal.dlsim(system, np.zeros((12, 1)), x0=[0.3, -2.0])
+    state = np.array([0.3, -2.0])
+    for row in seen:
+        np.testing.assert_allclose(state, row, atol=1e-9 * w)
+        state = transition @ state
+    # noise by integration: a thousand small steps of white force 4ζω³
+    n, step = 2000, interval / 2000
+    small = signal.cont2discrete((a, np.zeros((2, 1)), np.eye(2), np.zeros((2, 1))), step)[0]
+    cov = np.zeros((2, 2))
+    for _ in range(n):
+        cov = small @ cov @ small.T + np.diag([0.0, 4.0 * damping * w**3 * step])
+    # first order in ω times the step: 14e-3 at most
+    np.testing.assert_allclose(root @ root.T, cov, rtol=0.02, atol=0.02 * w)
 
 
 def test_a_servo_takes_what_is_below_its_bandwidth():

@@ -32,7 +32,7 @@ _LOOKS = {
 
 
 def away_marks(theme: Theme, pivot_enu_m: FloatArray, now: Instant, size_px: float) -> dict[str, Any]:
-    """Return what a scatter plot needs to cover mirrors that are not on the receiver with the marks of their modes."""
+    """Return what a scatter plot needs to put the marks of their modes on mirrors that are not on the receiver."""
     rows = np.flatnonzero(~now.on_receiver & (now.mode >= 0))
     looks = [_LOOKS[MODES[k]] for k in now.mode[rows]]
     return {
@@ -41,7 +41,7 @@ def away_marks(theme: Theme, pivot_enu_m: FloatArray, now: Instant, size_px: flo
         "symbol": [symbol for symbol, _ in looks],
         "brush": [pg.mkBrush(colour) for _, colour in looks],
         "pen": pg.mkPen(theme.text, width=1),
-        "size": size_px + 4.0,
+        "size": max(size_px - 2.0, 4.0),
     }
 
 
@@ -66,8 +66,8 @@ class ModeLegend:
                 item = pg.ScatterPlotItem(symbol=symbol, size=10, brush=colour, pen=pg.mkPen(self._theme.text, width=1))
                 self.key.addItem(item, mode_text(k))
         for (_, label), k in zip(self.key.items, self._modes, strict=True):
-            text = f"{mode_text(k)} {count[k]}"
-            label.setText(text + (", coloured by error" if k in ON_RECEIVER and count[k] else ""))
+            text = f"{mode_text(k)} {count[k]}" + (", coloured by error" if k in ON_RECEIVER and count[k] else "")
+            label.setText(text, color=self._theme.text if count[k] else self._theme.muted)
 
     def set_visible(self, visible: bool) -> None:
         """Show or hide the key."""

@@ -322,6 +322,18 @@ class Table(QTableWidget):
             self.selectRow(chosen)
         self.blockSignals(False)
 
+    def explain(self, column: int, text: str) -> None:
+        """Say what a column means, to who stays on its head with the mouse."""
+        head = self.horizontalHeaderItem(column)
+        if head is not None:
+            head.setToolTip(text)
+
+    def warn(self, rows: Sequence[int], colour: str) -> None:
+        """Write these rows in another colour."""
+        for item in (self.item(i, j) for i in rows for j in range(self.columnCount())):
+            if item is not None:
+                item.setForeground(QColor(colour))
+
     def choose(self, row: int | None) -> None:
         """Mark a row without telling anyone."""
         self.blockSignals(True)

@@ -35,7 +35,7 @@ __all__ = ["TrackingView"]
 _TICK_MS = 33
 _BEAMS = 400
 """With more mirrors than this only so many beams are drawn."""
-_MARK_ROOM = 0.02
+_MARK_ROOM = 0.035
 """Marks nearer to each other than this part of the time axis share a number."""
 _MOST_NUMBERS = 30
 
@@ -66,7 +66,7 @@ class TrackingView(View):
         return self.session.document is not None and self.session.document.track is not None
 
     def _build(self) -> None:
-        theme, playback = self.theme, self.session.playback
+        playback = self.session.playback
         self.play = QPushButton("Play")
         self.play.setToolTip("Play or pause (Space)")
         self.play.clicked.connect(lambda: playback.toggle())
@@ -157,16 +157,17 @@ class TrackingView(View):
             line.sigDragged.connect(lambda line: self._cursor_dragged(line))
             plot.addItem(line, ignoreBounds=True)
             self.cursor_lines.append(line)
-        for row, stretch in enumerate((6, 6, 5)):
-            self.graphs.ci.layout.setRowStretchFactor(row, stretch)
+        for row, height_px in enumerate((190, 160, 120)):
+            self.graphs.ci.layout.setRowPreferredHeight(row, height_px)
+            self.graphs.ci.layout.setRowStretchFactor(row, height_px)
 
     def _build_tables(self) -> None:
         self.table = Table(
             ("method", "now\n[mrad]", "rms\n[mrad]", "worst\n95 %", "worst\n[mrad]", "light\ncaught", "available")
         )
-        self.table.horizontalHeaderItem(5).setToolTip("Part of a perfect tracker's light, while on the receiver")
-        self.table.horizontalHeaderItem(6).setToolTip(
-            "Light caught over light offered in all modes: what stow, ways, calibrations and faults cost, too"
+        self.table.explain(5, "Part of a perfect tracker's light, while on the receiver")
+        self.table.explain(
+            6, "Light caught over light offered in all modes: what stow, ways, calibrations and faults cost, too"
         )
         self.table.itemSelectionChanged.connect(self._method_chosen)
         self.story = Table(("", "solar time", "what happened"))
@@ -207,16 +208,19 @@ class TrackingView(View):
         self._show_method()
 
     def _draw_curves(self, picture: TrackPicture) -> None:
+        nights = np.flatnonzero(np.diff(picture.track.day)) + 1
+        hours = np.insert(picture.hours, nights, np.nan)
         for k, name in enumerate(picture.methods):
             style = Qt.PenStyle.SolidLine if k < len(SERIES) else Qt.PenStyle.DashLine
             pen = pg.mkPen(SERIES[k % len(SERIES)], width=1.5, style=style)
-            error, flux = picture.rms_mrad[name], picture.flux[name]
+            error, flux = (np.insert(each[name], nights, np.nan) for each in (picture.rms_mrad, picture.flux))
             if (error > 0.0).any():  # a path of nothing but NaN takes Qt down
                 positive = np.where(error > 0.0, error, np.nan)
-                curve = self.curve_plot.plot(picture.hours, positive, pen=pen, name=name, connect="finite")
+                curve = self.curve_plot.plot(hours, positive, pen=pen, name=name, connect="finite")
                 self._curves.append((self.curve_plot, curve))
             if np.isfinite(flux).any():
-                self._curves.append((self.flux_plot, self.flux_plot.plot(picture.hours, flux, pen=pen)))
+                curve = self.flux_plot.plot(hours, flux, pen=pen, connect="finite")
+                self._curves.append((self.flux_plot, curve))
 
     def _show_method(self) -> None:
         """Show what belongs to the chosen method and stays while time goes on."""
@@ -244,10 +248,7 @@ class TrackingView(View):
             date = f"{picture.track.dates[each.day]} " if several else ""
             rows.append([number, f"{date}{clock(each.hour)}", each.text])
         self.story.fill(rows)
-        for i, each in enumerate(happened):
-            self.story.item(i, 2).setToolTip(each.text)
-            if each.trouble:
-                self.story.item(i, 2).setForeground(QColor(self.theme.warning))
+        self.story.warn([i for i, each in enumerate(happened) if each.trouble], self.theme.warning)
         self.tables.setTabVisible(1, bool(happened))
 
     def _mark(self, picture: TrackPicture, happened: tuple[Happening, ...]) -> list[str]:
@@ -376,7 +377,8 @@ class TrackingView(View):
         colour = self.scale.colours(now.error_mrad, "error of the normal [mrad]", (0.0, picture.limit_mrad[name]))
         pivot = picture.pivot_enu_m
         size = float(np.clip(160.0 / np.sqrt(max(len(pivot), 1)), 3.0, 14.0))
-        self.dots.set_data(pivot[:, 0], pivot[:, 1], colour, self.scale.table, size)
+        blank = np.where(now.on_receiver, colour, len(self.scale.table))
+        self.dots.set_data(pivot[:, 0], pivot[:, 1], blank, [*self.scale.table, QColor(self.theme.plot)], size)
         self.away.setData(**away_marks(self.theme, pivot, now, size))
         extent = max(float(np.ptp(pivot[:, :2], axis=0).max()), 1.0) if len(pivot) else 1.0
         self.normals.setData(*segments(pivot, pivot + 0.08 * extent * now.normal_enu))
@@ -384,7 +386,8 @@ class TrackingView(View):
         self.beams.setData(*segments(pivot[::every], now.beam_end_enu_m[::every]))
         targets = np.unique(picture.target_enu_m[np.isfinite(picture.target_enu_m).all(axis=1)], axis=0)
         self.target.setData(targets[:, 0], targets[:, 1])
-        self.spots.set_data(now.spot_m[:, 0], now.spot_m[:, 1], colour, self.scale.table, min(size, 8.0))
+        spot = now.spot_m
+        self.spots.set_data(spot[:, 0], spot[:, 1], colour, self.scale.table, min(size, 8.0))
 
     def _draw_picked(self, picture: TrackPicture, name: str, k: int) -> None:
         row = self._picked
