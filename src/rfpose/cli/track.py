@@ -135,15 +135,13 @@ def command(
     table(
         f"{summary['scenario']}: {summary['heliostats']} mirrors, {n_day} day{'s' if n_day > 1 else ''}; "
         "errors of the normal [mrad]",
-        ["method", "rms", "budget", "95 %", "worst", "mirror", "caught", "kWh/m²", "steps"],
+        ["method", "rms", "budget", "95 %", "worst", "caught", "kWh/m²", "steps"],
         [_row(name, summary["methods"][name]) for name in summary["ranking"]],
     )
     say(
-        "  rms, 95 % and worst of all mirrors and seconds; rms by the error budget, without simulating; rms of the worst"
+        "  rms, 95 % and worst of all mirrors and seconds; budget: the rms foreseen without simulating; part of a perfect"
     )
-    say(
-        "  mirror; part of a perfect tracker's light caught, light caught by a square metre of mirror; motor steps a day"
-    )
+    say("  tracker's light caught, light caught by a square metre of mirror; motor steps a mirror and day")
     for each in summary["iq"]:
         say(
             f"  {each['heliostat']} from samples: {each['solved']} of {each['postures']} postures, "
@@ -214,13 +212,7 @@ def _say_field_control(name: str, found: dict[str, Any]) -> None:
 
 def _row(name: str, found: dict[str, Any]) -> list[str]:
     normal = found["normal_mrad"]
-    cells = [
-        normal["rms"],
-        found["budget"]["total_mrad"],
-        normal["p95"],
-        normal["worst"],
-        normal["worst_heliostat_rms"],
-    ]
+    cells = [normal["rms"], found["budget"]["total_mrad"], normal["p95"], normal["worst"]]
     return [
         name,
         *("–" if value is None else f"{value:.3g}" for value in cells),
