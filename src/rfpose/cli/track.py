@@ -138,10 +138,8 @@ def command(
         ["method", "rms", "budget", "95 %", "worst", "caught", "kWh/m²", "steps"],
         [_row(name, summary["methods"][name]) for name in summary["ranking"]],
     )
-    say(
-        "  rms, 95 % and worst of all mirrors and seconds; budget: the rms foreseen without simulating; part of a perfect"
-    )
-    say("  tracker's light caught, light caught by a square metre of mirror; motor steps a mirror and day")
+    say("  rms, 95 % and worst of all mirrors and seconds; budget: the rms foreseen without simulating; part of a")
+    say("  perfect tracker's light caught, light caught by a square metre of mirror; motor steps a mirror and day")
     for each in summary["iq"]:
         say(
             f"  {each['heliostat']} from samples: {each['solved']} of {each['postures']} postures, "
