@@ -92,8 +92,9 @@ def track(
         "heliostats": str(len(simulation.field)),
     }
     key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
-    if scenario.tracking.wind.record is not None:
-        key["wind"] = hashlib.sha256(Path(scenario.tracking.wind.record).read_bytes()).hexdigest()
+    for name, path in (("wind", scenario.tracking.wind.record), ("beam", scenario.tracking.beam_record)):
+        if path is not None:
+            key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     place = result_path.with_name(f".{result_path.name}.state")
     checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
     try:
@@ -121,6 +122,8 @@ def _with(
     values = {name: value for name, value in changed.items() if value is not None}
     data = scenario.model_dump(exclude_none=True)
     table = {**data["tracking"], **values}
+    if values.get("sky") in ("clear", "bursts"):
+        table.pop("beam_record", None)
     if without_field_control:
         if events:
             raise ScenarioError("events need field control to act on; leave out one or the other")

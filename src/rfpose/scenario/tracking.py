@@ -296,8 +296,10 @@ class Tracking(Record):
     field_radius_m: Positive = 100.0
     """Where ``--heliostats`` puts mirrors that the scenario does not list."""
     inner_radius_m: NonNegative = 10.0
-    sky: Literal["clear", "bursts"] = "clear"
-    """Bursts: every second day or so in clouds, as at Griffith (Edwards, App. B)."""
+    sky: Literal["clear", "bursts", "record"] = "clear"
+    """Bursts: every second day or so in clouds, as at Griffith (Edwards, App. B); record: as `beam_record` has it."""
+    beam_record: str | None = None
+    """CSV of measured direct normal irradiance; its path from where the command is run."""
     servo_interval_s: Positive = 1.0
     control_interval_s: Positive = 4.0
     first_hour: Hour = 0.0
@@ -340,6 +342,8 @@ class Tracking(Record):
             raise ValueError("`store_interval_s` must be a multiple of `control_interval_s`")
         if not self.first_hour < self.last_hour:
             raise ValueError(f"`first_hour` {self.first_hour:g} must be before `last_hour` {self.last_hour:g}")
+        if (self.sky == "record") != (self.beam_record is not None):
+            raise ValueError('`sky = "record"` and `beam_record` belong together; give both or none')
         if not self.inner_radius_m < self.field_radius_m:
             raise ValueError("`inner_radius_m` must be less than `field_radius_m`")
         return self

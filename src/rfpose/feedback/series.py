@@ -1,0 +1,157 @@
+"""What weather stations write: a CSV of one quantity over time in, an even series out, gaps marked."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from rfpose.checks import FloatArray, as_positive, read_only
+from rfpose.errors import InvalidInputError
+from rfpose.feedback.sun import unix_seconds
+
+__all__ = ["Quantity", "read_series_csv"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Quantity:
+    """What a column holds.
+
+    Attributes
+    ----------
+    name, units
+        The column is called ``name_unit``; what a value in each unit is multiplied by.
+    unit
+        Of the values returned, as people write it.
+    most, beyond
+        Greatest value that can be true, and what more would be beyond.
+    """
+
+    name: str
+    units: Mapping[str, float]
+    unit: str
+    most: float
+    beyond: str
+
+
+def read_series_csv(
+    path: Path | str, quantity: Quantity, *, interval_s: float, longest_gap_s: float
+) -> tuple[float, FloatArray]:
+    """Read a series at even times.
+
+    The first line names the columns: ``time`` (ISO 8601 with time zone) or ``unix_s``, and the quantity with its unit.
+    Further columns are passed over, as are lines that begin with #. An empty value is a gap.
+
+    Parameters
+    ----------
+    path
+        The file.
+    quantity
+        What is wanted of it.
+    interval_s
+        Of the series wanted; between the file's samples it is taken in line [s].
+    longest_gap_s
+        Between samples further apart than this the quantity is unknown, NaN [s].
+
+    Returns
+    -------
+    start_unix_s, values
+        Time of the first sample [s since 1970 UTC], and (time,).
+
+    Raises
+    ------
+    InvalidInputError
+        No file, no such columns, no number, time that goes back or stands still, a value below zero or beyond what can
+        be, fewer than two known samples. The message names file, line and remedy.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{path}: must be a readable text file; {error}") from error
+    seconds, values = _parse(path, text, quantity)
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        raise InvalidInputError(
+            f"{path}: must hold two or more samples of known {quantity.name}, got {int(known.sum())}"
+        )
+    at, values = seconds[known], values[known]
+    n = int(np.floor((at[-1] - at[0]) / as_positive("interval_s", interval_s) + 1e-9)) + 1
+    grid = at[0] + interval_s * np.arange(n)
+    even = np.interp(grid, at, values)
+    after = np.clip(np.searchsorted(at, grid, side="right"), 1, len(at) - 1)
+    wide = at[after] - at[after - 1] > longest_gap_s
+    inside = (grid > at[after - 1] + 1e-9) & (grid < at[after] - 1e-9)
+    even[wide & inside] = np.nan
+    return float(at[0]), read_only(even)
+
+
+def _parse(path: Path, text: str, quantity: Quantity) -> tuple[FloatArray, FloatArray]:
+    """Return times [s] and values as the file has them, checked line by line."""
+    columns = [f"{quantity.name}_{unit}" for unit in quantity.units]
+    lines = [(i, line) for i, line in enumerate(io.StringIO(text), 1) if line.strip() and not line.startswith("#")]
+    if not lines:
+        raise InvalidInputError(f"{path}: must not be empty; the first line names columns such as time,{columns[0]}")
+    rows = list(csv.reader(line for _, line in lines))
+    header = [name.strip().lower() for name in rows[0]]
+    clock = next((name for name in ("unix_s", "time") if name in header), None)
+    unit = next((unit for unit, column in zip(quantity.units, columns, strict=True) if column in header), None)
+    if clock is None or unit is None:
+        raise InvalidInputError(
+            f"{path}: line {lines[0][0]} must name a column `time` or `unix_s` and one of "
+            f"{', '.join(f'`{column}`' for column in columns)}, got {', '.join(header)}"
+        )
+    i_clock, i_value = header.index(clock), header.index(f"{quantity.name}_{unit}")
+    seconds, values = np.empty(len(rows) - 1), np.empty(len(rows) - 1)
+    for i, ((number, _), row) in enumerate(zip(lines[1:], rows[1:], strict=True)):
+        place = f"{path}: line {number}"
+        if len(row) != len(header):
+            raise InvalidInputError(f"{place} must have {len(header)} columns, got {len(row)}")
+        seconds[i] = _moment(place, row[i_clock].strip(), clock)
+        if i and not seconds[i] > seconds[i - 1]:
+            raise InvalidInputError(
+                f"{place}: time must go on, got {row[i_clock]} after {rows[i][i_clock]}; sort the file"
+            )
+        values[i] = _value(place, row[i_value].strip(), quantity, unit)
+    return seconds, values
+
+
+def _moment(place: str, text: str, clock: str) -> float:
+    if clock == "time":
+        try:
+            moment = datetime.fromisoformat(text)
+            return float(unix_seconds([moment])[0])
+        except (ValueError, InvalidInputError) as error:
+            raise InvalidInputError(
+                f"{place}: `time` must be ISO 8601 with a time zone such as 2024-02-01T10:09:37Z, got {text!r}"
+            ) from error
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise InvalidInputError(f"{place}: `unix_s` must be a number of seconds, got {text!r}") from error
+    if not np.isfinite(value):
+        raise InvalidInputError(f"{place}: `unix_s` must be finite, got {text!r}")
+    return value
+
+
+def _value(place: str, text: str, quantity: Quantity, unit: str) -> float:
+    if not text:
+        return float("nan")
+    column = f"{quantity.name}_{unit}"
+    try:
+        value = float(text) * quantity.units[unit]
+    except ValueError as error:
+        raise InvalidInputError(f"{place}: `{column}` must be a number or empty, got {text!r}") from error
+    if value < 0.0:
+        raise InvalidInputError(f"{place}: `{column}` must not be negative, got {text}; mark gaps by an empty field")
+    if value > quantity.most:
+        raise InvalidInputError(
+            f"{place}: `{column}` {text} is {value:.0f} {quantity.unit}, beyond {quantity.beyond}; name the column "
+            f"after its unit ({', '.join(f'{quantity.name}_{u}' for u in quantity.units)})"
+        )
+    return value
