@@ -322,7 +322,7 @@ def _track(
                     _carried(heard[word], loop.turn * (age[word] + s - first), loop, seen)
                 reached = _command(model, k, known, row, seen, counts, work)
                 if reached:
-                    _nearest_turn(state[NEXT], k, counts)
+                    _nearest_turn(state[NEXT] if fresh else state[MOTOR], k, counts)
                     state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
             seen[:] = sun[s + ahead]
@@ -332,7 +332,8 @@ def _track(
             shift = state[SHIFT : SHIFT + 3]
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
                 reached = _shifted(model, k, known, shift, counts, guess, aside, work)
-            _nearest_turn(state[COMMAND], k, counts)
+            # from where the motor is: near the zenith commands swing faster than it can follow
+            _nearest_turn(state[COMMAND] if fresh else state[MOTOR], k, counts)
             if reached:
                 state[NEXT], state[NEXT + 1] = counts[0], counts[1]
                 state[UNREACHABLE] = 0.0
