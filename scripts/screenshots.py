@@ -16,6 +16,8 @@ from pathlib import Path
 
 os.environ["QT_QPA_PLATFORM"] = "offscreen"
 
+import numpy as np
+
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.process import process
@@ -24,8 +26,19 @@ from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.export import open_window, png_of, settle
 from rfpose.viewer.views.live import LiveView
+from rfpose.viewer.views.tracking import TrackingView
 
 SCALED = "viewer_field_200_percent.png"
+EVENTS = (
+    {"hour": 9.5, "what": "counts-lost", "heliostats": ("H05",)},
+    {"hour": 10.0, "what": "calibrate", "heliostats": ("H04",)},
+    {"hour": 10.2, "what": "zero-counts", "heliostats": ("H05",)},
+    {"hour": 10.5, "what": "calibrate", "heliostats": ("H05",)},
+    {"hour": 11.5, "what": "emergency"},
+    {"hour": 12.0, "what": "release"},
+    {"hour": 14.0, "what": "approach"},
+)
+"""Of the tracking run: one mirror loses its counts, one is calibrated, the field stows, a useless order is refused."""
 
 
 def site(folder: Path) -> Path:
@@ -66,6 +79,26 @@ def shoot(path: Path, output: Path, *, view: str, theme: str = "light", frame: i
     window.session.playback.scrub(frame)
     if path.name == "field.toml":
         window.session.layout.choose(posture="sun")
+    settle(app, window)
+    output.write_bytes(png_of(window))
+    window.close()
+    app.processEvents()
+    print(output)
+
+
+def tracking(path: Path, output: Path) -> None:
+    """Write a picture of a run while one mirror is on the calibration target and another in fault."""
+    app, window = open_window(path)
+    window.go_to("tracking")
+    view = window.views["tracking"]
+    assert isinstance(view, TrackingView)
+    assert window.session.document is not None
+    picture = window.session.document.track
+    assert picture is not None
+    calibration = next(each for each in picture.happened["radio"] if each.text == "calibrate: H04")
+    window.session.playback.scrub(int(np.searchsorted(picture.hours, picture.place_h(calibration))) + 1)
+    view.pick(picture.ids.index("H04"))
+    view.tables.setCurrentWidget(view.story)
     settle(app, window)
     output.write_bytes(png_of(window))
     window.close()
@@ -123,14 +156,14 @@ def main() -> None:
         site(folder)
         simulate_recording(scenario, recording, seed=1)
         process(recording, result)
-        track(shipped_scenario("tracking_100m.toml"), day, heliostats=40)
+        track(shipped_scenario("tracking_100m.toml"), day, events=EVENTS)
         welcome(out / "viewer_welcome.png", scenario)
         shoot(recording, out / "viewer_recording.png", view="recording", frame=3, transmitter=2)
         shoot(recording, out / "viewer_recording_dark.png", view="recording", frame=3, transmitter=2, theme="dark")
         shoot(result, out / "viewer_field.png", view="field", frame=5, heliostat=4)
         shoot(large_site(folder), out / "viewer_layout.png", view="layout")
         shoot(scenario, out / "viewer_layout_dark.png", view="layout", theme="dark")
-        shoot(day, out / "viewer_tracking.png", view="tracking", frame=150)
+        tracking(day, out / "viewer_tracking.png")
         tracked = Path("tracking_100m.toml")
         tracked.write_text(shipped_scenario(tracked.name).read_text())
         live(tracked, out / "viewer_live.png")
