@@ -301,8 +301,9 @@ def _track(
         g = step0 + s
         tick = g % loop.interval == 0
         if s % 16 == 0 or s == first:
-            p[0] = lean_north + lean[0] * heat[s]
-            p[1] = lean_east + lean[1] * heat[s]
+            # wherever a stretch is cut, the same lean
+            p[0] = lean_north + lean[0] * heat[s - s % 16]
+            p[1] = lean_east + lean[1] * heat[s - s % 16]
             _prepare(p, k, prepared)
         # where the model says the motors belong, now and one interval ahead
         if duty == GO:

@@ -89,20 +89,23 @@ class Campaign:
         i, stage = int(self._there["mirror"]), self._there["stage"]
         now_s = s * self._plan.servo_interval_s
         reported = Mode(int(control.reported_mode[i]))
-        if now_s - self._there["called_s"] > _LONGEST_S or reported in (Mode.STOW, Mode.STOWING, Mode.EMERGENCY):
+        silent_s = self._plan_control().watchdog_intervals * self._plan.control_interval_s
+        silent = silent_s < control.report_age_s[i] < np.inf
+        if now_s - self._there["called_s"] > _LONGEST_S or silent:
             self._dismiss(control, now_s, "given up", order=Event.TRACK if reported == Mode.CALIBRATE else None)
         elif control.waiting[i]:
             return
         elif reported == Mode.SEARCH:
             self._there["stage"] = "searching"
             self._search(i, s, day, aim_enu_m, state, model, true)
-        elif reported == Mode.DEFOCUS:
+        elif reported == Mode.DEFOCUS and stage == "searching":
             self._dismiss(control, now_s, "not found", order=Event.REFOCUS)
-        elif reported == Mode.CALIBRATE:
-            if stage != "there":
-                self._there |= {"stage": "there", "since_s": now_s, "looks": []}
-            elif now_s - self._there["since_s"] >= self._plan_control().calibration_dwell_s:
-                self._look(control, i, s, day, state, model, true)
+        elif reported != Mode.CALIBRATE:  # something else took it away
+            self._dismiss(control, now_s, "given up", order=None)
+        elif stage != "there":
+            self._there |= {"stage": "there", "since_s": now_s, "looks": []}
+        elif now_s - self._there["since_s"] >= self._plan_control().calibration_dwell_s:
+            self._look(control, i, s, day, state, model, true)
 
     def _plan_control(self) -> Any:
         assert self._plan.field_control is not None

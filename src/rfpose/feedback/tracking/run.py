@@ -194,6 +194,9 @@ class MethodRun:
         self.ring[:] = 0.0
         self.light[:] = 0.0
         self.state[:, _kernels.NEXT] = self._first_count(day)
+        if self._operation is not None and self.method.learns:
+            # overnight counts are referenced anew; what was learned of zeros that homing moved goes back with them
+            self.model[:, 3:5] -= self._operation.homing_rad
         self._operation = self._operate(i_day)
         if self._operation is not None:
             self._operation.park(self.state)
