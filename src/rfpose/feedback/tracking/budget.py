@@ -31,12 +31,13 @@ from rfpose.feedback.calibrated import PARAMETER_SETS
 from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.energy import combine_errors_rad, energy, representative_days
 from rfpose.feedback.mount import PARAMETERS, aim_rows
+from rfpose.feedback.servo import PiLaw
+from rfpose.feedback.servo.margins import is_stable
 from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import Field, draw_field
 from rfpose.feedback.tracking.instruments import _LARGE, _PRIORS, _TURNS, _WORMS, LEARNED, Workshop
-from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS, Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.timeline import Day, days, hour_of_day, site_of
@@ -292,7 +293,7 @@ def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -
     Raises
     ------
     ScenarioError, GeometryError, InvalidInputError
-        As `rfpose.feedback.tracking.Simulation` does.
+        As `rfpose.feedback.tracking.Simulation` does, but for gains, which may have any margin above none.
     """
     if method not in METHODS:
         raise InvalidInputError(f"no tracking method is called {method!r}; known are {', '.join(METHODS)}")
@@ -350,8 +351,7 @@ class _Budgeter:
         self._dish = plan.collector == "dish"
         self._radio: RadioModel | None = None
         if method.radio:
-            if not check_gains(scenario).stable:
-                raise InvalidInputError("[tracking.radio] these gains oscillate: no budget tells how far; lower them")
+            self._check_stable()
             noon = every[0].sun_enu[int(np.argmax(every[0].sun_enu[:, 2]))]
             self._radio = RadioModel(scenario, self._field.pivot_enu_m, usual_normal_enu=self._wanted(noon[None])[:, 0])
         self._workshop = Workshop(scenario, self._field, self._radio, self._gusts, seed=0)
@@ -359,6 +359,16 @@ class _Budgeter:
         self._loop = self._loop_of()
         self._mirror = method.feedback in (_kernels.RADIO, _kernels.SUN_SENSOR)
         self._square: dict[str, FloatArray] = {}
+
+    def _check_stable(self) -> None:
+        plan = self._plan
+        interval, late = plan.control_interval_s, plan.radio.latency_s
+        law = PiLaw(
+            gain_per_s=plan.radio.gain_per_s, integral_gain_per_s2=plan.radio.integral_gain_per_s2, levels=0
+        )  # fmt: skip
+        beyond = max(int(np.ceil(late / interval - 1e-9)) - 1, 0)
+        if not is_stable(law, None, interval_s=interval, latency_s=beyond * interval):
+            raise InvalidInputError("[tracking.radio] these gains oscillate: no budget tells how far; lower them")
 
     def _loop_of(self) -> SampledLoop | None:
         plan, servo = self._plan, self._plan.servo_interval_s

@@ -48,7 +48,7 @@ class Campaign:
         Whose beam is on the target now, of those that search.
     results
         What came of each: ``heliostat``, ``outcome`` (corrected, on target, not found, given up), ``searched``,
-        ``offset_mm`` that the camera saw, ``took_s``.
+        ``offset_mm`` that the camera saw, ``at_s`` after the day's first step, ``took_s``.
     """
 
     def __init__(self, scenario: Scenario, field: Field, *, feedback: int, seed: int) -> None:
@@ -134,6 +134,7 @@ class Campaign:
                 "outcome": outcome,
                 "searched": self._there["searched"],
                 "offset_mm": None if offset is None else [1e3 * each for each in offset],
+                "at_s": self._there["called_s"],
                 "took_s": now_s - self._there["called_s"],
             }
         )

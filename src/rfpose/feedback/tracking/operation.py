@@ -231,10 +231,14 @@ class Operation:
         """Return the day in plain values: events, alarms, calibrations, messages."""
         return {
             "events": self.log,
-            "alarms": self.watch.found,
-            "calibrations": self.campaign.results,
+            "alarms": [each | {"hour": self._hour(each["at_s"])} for each in self.watch.found],
+            "calibrations": [each | {"hour": self._hour(each["at_s"])} for each in self.campaign.results],
             "messages": self.control.messages.as_dict(),
         }
+
+    def _hour(self, at_s: float) -> float:
+        """Return local mean solar time so long after the day's first step [h]."""
+        return float(self._day.hour[round(at_s / self._servo_s)])
 
     def _told(self, words: list[Orders], s: int, until: int, state: FloatArray) -> Told:
         orders = words[0]
