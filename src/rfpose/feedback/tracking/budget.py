@@ -9,7 +9,8 @@ leaves of it at the servo's steps, between measurements too (`SampledLoop.left`)
 mounts is propagated to first order, through the least squares with which the model was fitted.
 
 Left out: mirrors that pass the zenith; radio outages, clouds that blind a sun sensor; modes, messages and events of
-field control; the drives' top speed; errors of second order; what a quantised or loose drive does to the loop's gain;
+field control; the drives' top speed; errors of second order; what a quantised or loose drive does to the loop's gain, and
+what the loop's corrections make the structure swing by (much only for modes below 1 Hz, or gains near the margin);
 how the loop catches up with slow errors of the mount, which its integral leaves less than 0.01 mrad of; corrections of
 the zeros that stop within their tolerance; ground reflections in what radio teaches a model.
 """
