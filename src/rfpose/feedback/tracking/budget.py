@@ -2,17 +2,17 @@
 
 After Edwards, Arrays of paraboloidal collectors, §5.4.10: errors random in time, and errors that are constant for a
 mirror but random over the field, add as squares to one rms; that gives the intercept, and the intercept the loss of a
-day and of a year. Each part follows from the scenario alone: nothing random is drawn.
+day and of a year. Each part follows from the scenario alone, whatever the seed.
 
 Feedback is taken as linear, with lost frames as a weaker gain. A disturbance is passed on by what the sampled loop
 leaves of it at the servo's steps, between measurements too (`SampledLoop.left`). What models do not know of their
 mounts is propagated to first order, through the least squares with which the model was fitted.
 
 Left out: mirrors that pass the zenith; radio outages, clouds that blind a sun sensor; modes, messages and events of
-field control; the drives' top speed; errors of second order; what a quantised or loose drive does to the loop's gain, and
-what the loop's corrections make the structure swing by (much only for modes below 1 Hz, or gains near the margin);
-how the loop catches up with slow errors of the mount, which its integral leaves less than 0.01 mrad of; corrections of
-the zeros that stop within their tolerance; ground reflections in what radio teaches a model.
+field control; the drives' top speed; errors of second order; what a quantised or loose drive does to the loop's gain;
+what the loop's corrections make the structure swing by (much only for modes below 1 Hz, or gains near the margin); how
+the loop catches up with slow errors of the mount, which its integral leaves less than 0.01 mrad of; corrections of the
+zeros that stop within their tolerance; ground reflections in what radio teaches a model.
 """
 
 from __future__ import annotations
