@@ -41,6 +41,7 @@ from rfpose.feedback.tracking.hidden import Field, draw_field
 from rfpose.feedback.tracking.instruments import _LARGE, _PRIORS, _TURNS, _WORMS, LEARNED, Workshop
 from rfpose.feedback.tracking.methods import METHODS, Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import Day, days, hour_of_day, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
@@ -193,7 +194,8 @@ class Budget:
     perfect_intercept
         The same of a perfect tracker; below one for a dish.
     offered_kwh_per_m2, offered_kwh_per_m2_year
-        Light on a square metre of mirror over the scenario's days, and over a year of whole clear days.
+        Light on a square metre of mirror over the scenario's days, clear or as recorded (bursts are left out), and
+        over a year of whole clear days.
     """
 
     method: str
@@ -342,6 +344,8 @@ class _Budgeter:
         self._scenario, self._method, self._plan = scenario, method, plan
         self._site = site_of(scenario)
         every = days(scenario)
+        if plan.sky == "record":
+            every = under_sky(scenario, every, seed=0)
         self._every = every
         self._days = [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_N_DAY, len(every))).astype(int))]
         course = every[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
@@ -404,7 +408,7 @@ class _Budgeter:
         return dataclasses.replace(
             found,
             intercept=float(mean_intercept(table, found.total_rad)),
-            posture_intercept=float(light[0] / light[1]),
+            posture_intercept=float(light[0] / light[1]) if light[1] > 0.0 else float("nan"),
             perfect_intercept=float(table[0]),
             offered_kwh_per_m2=day_kwh,
             offered_kwh_per_m2_year=year_kwh,
