@@ -1,5 +1,6 @@
 """The error budget of a tracked field: sampled loops, parts one by one against the simulation, intercept and light."""
 
+import datetime
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rfpose.feedback.energy import dish_capture, heliostat_intercept
 from rfpose.feedback.tracking import Simulation, score
 from rfpose.feedback.tracking.budget import SampledLoop, mean_intercept, track_budget
 from rfpose.feedback.tracking.capture import capture_table
+from rfpose.feedback.tracking.timeline import day_of
 from rfpose.scenario import Scenario, load_scenario
 
 DATA = Path(__file__).resolve().parents[3] / "data" / "tracking_100m.toml"
@@ -192,6 +194,20 @@ def test_a_steady_wind_bends_open_loops_and_is_taken_out_of_closed_and_calibrate
     assert track_budget(scenario, "open-loop").steady_wind_rad == pytest.approx(64e-3 * np.hypot(3e-3, 6e-3))
     assert track_budget(scenario, "radio").steady_wind_rad == 0.0
     assert track_budget(scenario, "camera-model").steady_wind_rad < 0.05e-3
+
+
+def test_the_plate_as_mounted_and_its_daily_bend():
+    mounted = changed((9.0, 10.0), QUIET, {"radio": {"plate_sigma_mrad": 0.6, "plate_drift_mrad": 0.6}})
+    budget = track_budget(mounted, "radio")
+    heat = day_of(mounted, mounted.tracking.date, 0).heat[120:]
+    assert budget.plate_rad == pytest.approx(0.6e-3 * np.sqrt(2.0))
+    assert budget.plate_drift_rad == pytest.approx(0.6e-3 * np.sqrt(np.mean(heat**2)), rel=0.01)
+    # a camera's sixteen looks, 45 days before, take off the mean bend of their day
+    calibrated = changed((9.0, 10.0), QUIET, {"radio": {"plate_drift_mrad": 0.6, "plate_calibration": "camera"}})
+    before = day_of(mounted, mounted.tracking.date - datetime.timedelta(days=45), -45, whole=True)
+    looks = before.heat[np.linspace(0, len(before.heat) - 1, 18).astype(int)[1:-1]]
+    left = 0.6e-3 * np.sqrt(np.mean((heat - looks.mean()) ** 2))
+    assert track_budget(calibrated, "radio").plate_drift_rad == pytest.approx(left, rel=0.01)
 
 
 def test_measured_wind(tmp_path):

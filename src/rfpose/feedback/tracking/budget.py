@@ -39,7 +39,7 @@ from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import Field, draw_field
 from rfpose.feedback.tracking.instruments import _LARGE, _PRIORS, _TURNS, _WORMS, LEARNED, Workshop
-from rfpose.feedback.tracking.methods import METHODS, Method, choose
+from rfpose.feedback.tracking.methods import Method, choose
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import Day, days, hour_of_day, site_of
@@ -289,7 +289,7 @@ def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -
     scenario
         Site, mirrors, radio, and ``[tracking]``.
     method
-        One of `METHODS`.
+        One of `rfpose.feedback.tracking.METHODS`.
     count
         Number of mirrors; None: those of the scenario. Up to 48 of them, and up to 12 of the days, stand for all.
 
@@ -298,8 +298,6 @@ def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -
     ScenarioError, GeometryError, InvalidInputError
         As `rfpose.feedback.tracking.Simulation` does, but for gains, which may have any margin above none.
     """
-    if method not in METHODS:
-        raise InvalidInputError(f"no tracking method is called {method!r}; known are {', '.join(METHODS)}")
     chosen = choose((method,), collector=scenario.tracking.collector)[0]
     return _Budgeter(scenario, chosen, count).budget()
 
