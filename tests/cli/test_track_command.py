@@ -42,7 +42,7 @@ def test_table_json_csv_and_picture(site, tmp_path):
     assert found["heliostats"] == 12
     assert found["days"] == ["2026-03-20"]
     assert found["methods"]["radio-both"]["normal_mrad"]["rms"] < 0.3
-    assert found["methods"]["open-loop"]["outage"]["rms_mrad"] is None
+    assert found["methods"]["open-loop"]["outages"] == []
     assert picture.read_bytes().startswith(b"\x89PNG")
     with table.open() as file:
         rows = list(csv.DictReader(file))
@@ -118,6 +118,122 @@ def test_bad_sites_are_one_line(site, tmp_path, old, new, complaint):
     shown = run(site, "-o", tmp_path / "x.h5")
     assert shown.exit_code == 3
     assert complaint in shown.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--event", "9.2 stow H99"], "names heliostat 'H99', which is not tracked; tracked are H01 to H12"),
+        (["--event", "9.2 cluster-fails #1"], "names cluster 1; 12 heliostats make clusters 0 to 0"),
+        (["--event", "9.2 stow", "--event", "9.2 defocus H03"], "`stow` and `defocus` contradict each other"),
+        (["--event", "2:9.2 stow"], "is on day 2, and only 1 are simulated"),
+        (["--event", "9.2 emergency H01"], "concerns the whole field; name nobody"),
+        (["--event", "9.2 cluster-fails"], "needs the number of a `cluster`"),
+        (["--event", "9.2 dance"], "what"),
+        (["--event", "11:30 emergency"], "hour"),
+        (["--event", "nan emergency"], "hour"),
+        (["--event", "9.2 emergency", "--without-field-control"], "events need field control to act on"),
+    ],
+)
+def test_events_that_cannot_be_are_one_line(site, tmp_path, arguments, complaint):
+    shown = run(site, "-o", tmp_path / "x.h5", "--methods", "open-loop", *arguments)
+    assert shown.exit_code == 3, shown.output
+    assert complaint in shown.output
+    assert str(site) in shown.output
+    told = [line for line in shown.output.splitlines() if line.strip()]
+    assert len(told) == 1, told
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["site.toml"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "emergency", "noon emergency", "9 calibrate H01, H02", "1.5:9 stow", "9 stow #two"]
+)
+def test_events_that_cannot_be_read_are_the_commands_fault(site, tmp_path, text):
+    shown = run(site, "-o", tmp_path / "x.h5", "--event", text)
+    assert shown.exit_code == 2, shown.output
+    assert "--event" in shown.output
+    assert "'11.5 emergency'" in shown.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["site.toml"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "event", "complaint"),
+    [
+        ("calibration_target_enu_m = [0.0, 0.0, 40.0]", "", "9.2 calibrate", "needs a target"),
+        ("[tracking.wind]", 'collector = "dish"\n[tracking.wind]', "9.2 defocus", "is for heliostats"),
+    ],
+)
+def test_events_that_the_site_has_no_means_for(site, tmp_path, old, new, event, complaint):
+    text = site.read_text()
+    assert old in text
+    text = text.replace(old, new)
+    if "dish" in new:
+        text = text.replace('collector = "dish"\n', "").replace("date = 2026", 'collector = "dish"\ndate = 2026')
+    site.write_text(text)
+    shown = run(site, "-o", tmp_path / "x.h5", "--methods", "open-loop", "--event", event)
+    assert shown.exit_code == 3
+    assert complaint in shown.output
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_what_happened_is_told_and_kept(site, tmp_path):
+    out = tmp_path / "alarm.h5"
+    events = ("9.2 emergency", "9.3 approach H02", "1:9.4 release")
+    arguments = ["--methods", "open-loop", "--heliostats", "3", *(a for e in events for a in ("--event", e))]
+    shown = run(site, "-o", out, "--json", *arguments)
+    assert shown.exit_code == 0, shown.output
+    found = json.loads(shown.stdout)["methods"]["open-loop"]
+    (day,) = found["field_control"]
+    assert day["day"] == "2026-03-20"
+    assert [e["what"] for e in day["events"]] == ["emergency", "approach", "release"]
+    assert list(day["events"][1]["refused"].values()) == [1]
+    (alarm,) = day["alarms"]
+    assert alarm["stowed_s"] < 300.0
+    modes = found["modes"]
+    assert sum(mode["hours"] for mode in modes.values()) == pytest.approx(0.7, abs=0.01)
+    assert modes["stow"]["lost_kwh_per_m2"] == pytest.approx(modes["stow"]["offered_kwh_per_m2"])
+    lost = sum(m["lost_kwh_per_m2"] for m in modes.values())
+    offered = sum(m["offered_kwh_per_m2"] for m in modes.values())
+    assert found["availability"] == pytest.approx(1.0 - lost / offered)
+    assert found["energy_kwh_per_m2"] == pytest.approx(offered - lost)
+    kept = read_track(out)
+    assert kept.as_dict()["methods"]["open-loop"] == found
+    assert [event.what for event in kept.scenario.tracking.event] == ["emergency", "approach", "release"]
+    assert kept.methods["open-loop"].happened[0] == day
+    plain = run(site, "-o", tmp_path / "again.h5", *arguments)
+    assert "flux below a tenth after" in plain.output
+    assert "1 mirrors: APPROACH refused: emergency since" in plain.output
+    assert (tmp_path / "again.h5").read_bytes() == out.read_bytes()
+    off = run(site, "-o", tmp_path / "off.h5", "--methods", "open-loop", "--without-field-control", "--json")
+    without = json.loads(off.stdout)["methods"]["open-loop"]
+    assert "field_control" not in without
+    assert list(without["modes"]) == ["track"]
+    assert read_track(tmp_path / "off.h5").scenario.tracking.field_control is None
+
+
+def test_stopped_in_an_emergency_and_resumed_equals_undisturbed(site, tmp_path):
+    whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
+    # a stretch ends a quarter of an hour after nine
+    events = [{"hour": 9.24, "what": "emergency"}, {"hour": 9.4, "what": "release"}]
+    arguments = {"methods": ("open-loop", "encoder"), "heliostats": 3, "seed": 5, "events": events}
+    track(site, whole, **arguments)
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            track(site, parts, **arguments, checkpoint_s=0.0, on_progress=stop)
+    with pytest.raises(RecordingError, match="another job"):
+        track(site, parts, **arguments | {"events": events[:1]})
+    with pytest.raises(RecordingError, match="another job"):
+        track(site, parts, **arguments | {"events": (), "without_field_control": True})
+    seen = []
+    resumed = track(site, parts, **arguments, on_progress=lambda done, total: seen.append(done))
+    assert seen == [3]
+    assert parts.read_bytes() == whole.read_bytes()
+    assert resumed.methods["encoder"].happened[0]["alarms"][0]["stowed_s"] is not None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.h5", "site.toml", "whole.h5"]
 
 
 def test_radio_without_transmitters_is_refused(site, tmp_path):

@@ -111,6 +111,25 @@ def test_contradictions_are_named(old, new, words):
     assert "\n" not in str(caught.value)
 
 
+def test_field_control_and_events_survive_a_round_trip():
+    text = (DATA / "tracking_100m.toml").read_text()
+    table = (
+        '\n[[tracking.event]]\nhour = 9.5\nwhat = "calibrate"\nheliostats = ["H01", "H03"]\n'
+        '[[tracking.event]]\nhour = 12\nwhat = "cluster-fails"\ncluster = 0\nday = 1\n'
+        "[tracking.structure]\nnatural_hz = 3.3\ndamping = 0.05\n[tracking.aperture]\nimage_ratio = 1.2\n"
+    )
+    s = parse_scenario(text + table)
+    assert [event.what for event in s.tracking.event] == ["calibrate", "cluster-fails"]
+    assert s.tracking.event[0].heliostats == ("H01", "H03")
+    again = parse_scenario(s.to_toml())
+    assert again == s
+    assert again.tracking.structure.natural_hz == 3.3
+    with pytest.raises(ScenarioError, match=r"^site\.toml: .*unknown key.*field_control.*watchdog_s") as caught:
+        parse_scenario(text.replace("[tracking.field_control.bus]", "watchdog_s = 3\n[tracking.field_control.bus]"),
+                       source="site.toml")  # fmt: skip
+    assert "\n" not in str(caught.value)
+
+
 def test_missing_and_binary_files(tmp_path):
     with pytest.raises(ScenarioError, match=r"nowhere\.toml"):
         load_scenario(tmp_path / "nowhere.toml")

@@ -84,7 +84,7 @@ class Structure(Record):
 class Aperture(Record):
     """What catches the light."""
 
-    image_ratio: Positive = 1.0
+    image_ratio: Annotated[float, Field(gt=0, le=8)] = 1.0
     """Heliostats: radius of the receiver's aperture over that of a mirror's image; 1 is Malan's (3.3)."""
     h_per_deg: Positive = 3.9
     """Dishes: accuracy of the contour (Edwards, ch. 4)."""
@@ -357,6 +357,12 @@ class Tracking(Record):
             raise ValueError(
                 f"`wind_release_mps` {control.wind_release_mps:g} must not exceed `wind_stow_mps` "
                 f"{control.wind_stow_mps:g}"
+            )
+        low, high = self.drive.elevation_limits_deg
+        if control is not None and not low <= control.stow_deg[1] <= high:
+            raise ValueError(
+                f"[tracking.field_control] `stow_deg` has an elevation of {control.stow_deg[1]:g} degrees, beyond the "
+                f"drive's limits of {low:g} to {high:g}"
             )
         for one, other in itertools.combinations(self.event, 2):
             if one.contradicts(other):

@@ -176,9 +176,15 @@ class FieldControl:
         self._check_cluster(cluster)
         self._wire.alive[cluster] = True
 
-    def power_off(self, heliostats: npt.ArrayLike | None = None) -> None:
-        """Take the power; step counts are stored while a buffer lasts, and orders on the wire are not heard."""
+    def power_off(self, heliostats: npt.ArrayLike | None = None, *, axis_rad: npt.ArrayLike | None = None) -> None:
+        """Take the power; step counts are stored while a buffer lasts, and orders on the wire are not heard.
+
+        ``axis_rad`` (heliostat, axis): where the axes are by now [rad]; None: as at the last step.
+        """
         index = self._indices(heliostats)
+        if axis_rad is not None:
+            now = as_float_array("axis_rad", axis_rad, (self.n_heliostat, 2), finite=False)
+            self._heliostats.axis_rad[index] = now[index]
         self._heliostats.stored_rad[index] = self._heliostats.axis_rad[index]
         self._heliostats.apply(index, Event.POWER_OFF, self._time_s)
         self._wire.silence(index)

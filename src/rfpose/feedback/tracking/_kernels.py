@@ -35,6 +35,8 @@ LOST, USED, HEARD = 0.0, 1.0, 2.0
 N_SCRATCH = 112
 N_BLOCK = 64
 """Mirrors are shared out in so many parts, each with room of its own to work in."""
+FEW = 48
+"""Up to so many mirrors one core is quicker than sharing them out, since field control has a word each second."""
 
 # what is added up over a day
 (
@@ -338,6 +340,9 @@ def _track(
             if reached:
                 state[NEXT], state[NEXT + 1] = counts[0], counts[1]
                 state[UNREACHABLE] = 0.0
+                if math.isfinite(age[word]) and loop.turn == 0.0:
+                    # a sun that is held: go there at once, and stand
+                    state[COMMAND], state[COMMAND + 1] = counts[0], counts[1]
             else:
                 state[UNREACHABLE] = 1.0
                 for a in range(2):
@@ -580,6 +585,29 @@ def _track(
     p[0], p[1] = lean_north, lean_east
 
 
+@kernel
+def advance_some(
+    row, end_row,
+    loop, law, drive_1, drive_2, table,
+    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
+    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
+    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
+    stride, trace_error, trace_light, stored, trace, light,
+):  # fmt: skip
+    """Take mirrors ``row`` to before ``end_row`` through a stretch, one after the other; see `advance`."""
+    scratch = np.empty(N_SCRATCH)
+    for h in range(row, end_row):
+        keeps = stored[h] >= 0
+        _track(
+            loop, law, drive_1, drive_2, table,
+            step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
+            p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
+            mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
+            sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h],
+            stride, trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
+        )  # fmt: skip
+
+
 @kernel_parallel
 def advance(
     loop, law, drive_1, drive_2, table,
@@ -609,14 +637,11 @@ def advance(
     n = p.shape[0]
     share = max(n // N_BLOCK, 1)
     for block in nb.prange((n + share - 1) // share):
-        scratch = np.empty(N_SCRATCH)
-        for h in range(block * share, min((block + 1) * share, n)):
-            keeps = stored[h] >= 0
-            _track(
-                loop, law, drive_1, drive_2, table,
-                step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
-                p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
-                mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-                sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h],
-                stride, trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
-            )  # fmt: skip
+        advance_some(
+            block * share, min((block + 1) * share, n),
+            loop, law, drive_1, drive_2, table,
+            step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
+            p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
+            bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
+            stride, trace_error, trace_light, stored, trace, light,
+        )  # fmt: skip

@@ -325,8 +325,8 @@ class LiveField:
         run, field, day, n_step, n = self._run, self.field, self._day, self._interval, len(self.field)
         n_free = run.cov.shape[1]
         rng = generator(self._seed, 16, steps.start)
-        _kernels.advance(
-            run.loop, run.law, *(drive_numbers(self._scenario, axis) for axis in (0, 1)), self._plan.world.table,
+        _kernels.advance_some(
+            0, n, run.loop, run.law, *(drive_numbers(self._scenario, axis) for axis in (0, 1)), self._plan.world.table,
             steps.start, *span, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
             told.age, field.at(0.0), field.constant, field.lean_rad, day.heat[steps].copy(), run.model,
             np.zeros((n, n_free, n_free)), np.zeros(n_free, np.int64), np.zeros(n_free), np.zeros(n_free),

@@ -33,8 +33,6 @@ from rfpose.scenario.tracking import Event as Happening
 
 __all__ = ["Operation", "Told", "aim_count", "who_of"]
 
-_LATE_INTERVALS = 1.5
-"""From a round to the middle of the interval in which its sun is used."""
 _SILENT_FRAMES = 5.0
 _WORDS_AHEAD = 4
 """Control intervals that are told at once while nothing happens; so much later may a mode show that radio is lost."""
@@ -124,7 +122,8 @@ class Operation:
         self._works_until = int(np.flatnonzero(day.works)[-1])
         self._home, self._per_rad = field.constant[:, 15:17].copy(), field.constant[:, 13:15]
         # the turn on which the park position lies within half a turn of the middle of the travel
-        self._home[:, 0] -= 2.0 * np.pi * np.rint(self._home[:, 0] / (2.0 * np.pi))
+        parked = self.control.settings.stow_axis_rad[0]
+        self._home[:, 0] -= 2.0 * np.pi * np.rint((self._home[:, 0] - parked) / (2.0 * np.pi))
         self.campaign = Campaign(scenario, field, feedback=feedback, seed=seed)
         self.watch = AlarmWatch(n)
         self._out = np.ones(n, np.bool_)
@@ -179,7 +178,8 @@ class Operation:
                 at * self._servo_s,
                 axis_rad=axis,
                 aim_axis_rad=aim_axis,
-                sun_enu=self._day.sun_enu[at],
+                # held, a sun counts from the interval after it was sent: the centre says where it will be then
+                sun_enu=self._day.sun_enu[at + (self._interval if self._held else 0)],
                 wind_m_s=self._wind_mps.at(at, span[0], gust),
                 feedback_valid=self._valid(state),
                 found=self.campaign.found,
@@ -189,7 +189,7 @@ class Operation:
         aim_axis = np.full(axis.shape, np.nan)
         orders, self._ahead = self._ahead, None
         if orders is None:
-            self._let_happen(s, light)
+            self._let_happen(s, light, axis)
             self._programme(s)
             self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, true)
             aim_axis = self._aim_axis_rad(s, state, model)
@@ -197,14 +197,14 @@ class Operation:
         self._home_counts(orders.mode, state, s)
         self.watch.observe(s * self._servo_s, orders.mode, light, orders.alarms)
         words = [orders]
-        until = self._holds_until(s)
-        while len(words) < _WORDS_AHEAD and until < span[1] and self._calm(until):
+        until, quiet = self._holds_until(s)
+        while quiet and len(words) < _WORDS_AHEAD and until < span[1] and self._calm(until):
             later = step(until)
             if later.changed.any() or later.alarms != orders.alarms:
                 self._ahead = later
                 break
             words.append(later)
-            until = self._holds_until(until)
+            until, quiet = self._holds_until(until)
         return self._told(words, s, min(until, span[1]), state)
 
     def _calm(self, s: int) -> bool:
@@ -215,17 +215,21 @@ class Operation:
     def _due(self, s: int) -> bool:
         return self._next_event < len(self._events) and self._events[self._next_event][0] <= s
 
-    def _holds_until(self, s: int) -> int:
-        """Return the step up to which a word holds: a second, or the rest of a control interval in quiet."""
+    def _holds_until(self, s: int) -> tuple[int, bool]:
+        """Return the step up to which a word holds: a second, or the rest of a control interval; and if it is quiet."""
         tick = (s // self._interval + 1) * self._interval
         if self._next_event < len(self._events):
             tick = min(tick, max(self._events[self._next_event][0], s + 1))
-        quiet = self.control.quiet_until(tick * self._servo_s) >= tick * self._servo_s
-        return tick if quiet and not self.watch.open else s + 1
+        quiet = self.control.quiet_until(tick * self._servo_s) >= tick * self._servo_s and not self.watch.open
+        return (tick if quiet else s + 1), quiet
 
     def end(self) -> None:
         """Close what is under way at the end of the day."""
         self.watch.close()
+        for _, event, who in self._events[self._next_event :]:
+            late = {"the field's day was over": int(who.sum())}
+            self.log.append({"what": event.what, "hour": event.hour, "heliostats": int(who.sum()), "refused": late})
+        self._next_event = len(self._events)
 
     def report(self) -> dict[str, Any]:
         """Return the day in plain values: events, alarms, calibrations, messages."""
@@ -251,9 +255,8 @@ class Operation:
         goal = np.where(np.isfinite(goal), goal, state[:, _kernels.MOTOR : _kernels.MOTOR + 2])
         renew = follows & ((self._last_duty == _kernels.GO) | (aim != self._last_aim).any(axis=1))
         self._last_duty, self._last_aim = duty, aim
-        late_s = _LATE_INTERVALS * self._interval * self._servo_s if self._held else 0.0
         since = np.array([word.time_s / self._servo_s - s for word in words])
-        age = np.stack([(word.sun_age_s - late_s) / self._servo_s for word in words], axis=1) - since
+        age = np.stack([word.sun_age_s / self._servo_s for word in words], axis=1) - since
         heard = np.stack([word.sun_enu for word in words], axis=1)
         return Told(
             until=until,
@@ -304,23 +307,23 @@ class Operation:
         if to.any():
             self.control.command(command, to)
 
-    def _let_happen(self, s: int, light: FloatArray) -> None:
+    def _let_happen(self, s: int, light: FloatArray, axis_rad: FloatArray) -> None:
         while self._due(s):
             _, event, who = self._events[self._next_event]
             self._next_event += 1
             entry: dict[str, Any] = {"what": event.what, "hour": event.hour, "heliostats": int(who.sum())}
-            reasons = self._do(event, who)
+            reasons = self._do(event, who, axis_rad)
             if reasons:
                 entry["refused"] = reasons
-            if event.what == "emergency":
+            elif event.what == "emergency":
                 self.watch.begin(s * self._servo_s, "emergency", light)
             self.log.append(entry)
 
-    def _do(self, event: Happening, who: npt.NDArray[np.bool_]) -> dict[str, int]:
+    def _do(self, event: Happening, who: npt.NDArray[np.bool_], axis_rad: FloatArray) -> dict[str, int]:
         """Let an event happen; return how many mirrors refuse an order, by reason."""
         control = self.control
         if event.what in _COMMANDS:
-            if event.what in ("stow", "approach"):
+            if event.what in ("stow", "hold", "approach"):
                 self._out[who] = event.what == "approach"
             return _counted(control.command(_COMMANDS[event.what], who).reasons)
         if event.what == "calibrate":
@@ -332,11 +335,11 @@ class Operation:
              "centre-returns": control.repair_centre}[event.what]()  # fmt: skip
             self._centre_dead = {"centre-fails": True, "centre-returns": False}.get(event.what, self._centre_dead)
         elif event.what == "power-fails":
-            control.power_off(who)
+            control.power_off(who, axis_rad=axis_rad)
         elif event.what == "power-returns":
             control.power_on(who & (control.mode == Mode.POWER_LOSS))
         elif event.what == "counts-lost":
-            control.power_off(who)
+            control.power_off(who, axis_rad=axis_rad)
             control.power_on(who, counts_kept=False)
         else:
             assert event.cluster is not None
@@ -406,7 +409,11 @@ class _Wind:
         # each sample stands for the time until the next one
         times = np.array([each[0] for each in self.past] + [s + 1])
         speeds = np.array([each[1] for each in self.past])
-        return float(np.average(speeds, weights=np.diff(times)))
+        total, length = float(speeds @ np.diff(times)), s + 1 - self.past[0][0]
+        if not self._gusts.recorded and length < self._n_average:
+            # before the day's first step the wind was what it is on the average
+            total, length = total + (self._n_average - length) * self._gusts.mean_mps, self._n_average
+        return total / length
 
 
 def bus_of(scenario: Scenario) -> BusSettings:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -194,9 +195,8 @@ class MethodRun:
         self.ring[:] = 0.0
         self.light[:] = 0.0
         self.state[:, _kernels.NEXT] = self._first_count(day)
-        if self._operation is not None and self.method.learns:
-            # overnight counts are referenced anew; what was learned of zeros that homing moved goes back with them
-            self.model[:, 3:5] -= self._operation.homing_rad
+        # overnight counts are referenced anew; what was learned of counts that homing moved is worth nothing then
+        homed = None if self._operation is None else self._operation.homing_rad.any(axis=1)
         self._operation = self._operate(i_day)
         if self._operation is not None:
             self._operation.park(self.state)
@@ -204,6 +204,9 @@ class MethodRun:
             passed = day.since_first - world.days[i_day - 1].since_first
             sigma = 1e-3 * world.scenario.tracking.radio_model.forget_mrad_per_sqrt_day
             self.cov[:, np.arange(len(_FREE)), np.arange(len(_FREE))] += sigma**2 * passed
+            if homed is not None and homed.any():
+                self.model[homed] = world.workshop.model(self.method, day)[homed]
+                self.cov[homed] = _FIRST_SIGMA_RAD**2 * np.eye(len(_FREE))
             return
         self.model[:] = world.workshop.model(self.method, day)
 
@@ -251,6 +254,7 @@ class MethodRun:
         sun = day.sun_enu[segment.first : segment.end + self.loop.interval + 1].copy()
         drives, drift = [drive_numbers(world.scenario, axis) for axis in (0, 1)], self._drift_rad()
         told = Told.always_track(field)
+        advance = partial(_kernels.advance_some, 0, n) if n <= _kernels.FEW else _kernels.advance
         s = 0
         while s < n_step:
             end = n_step
@@ -264,7 +268,7 @@ class MethodRun:
             at = slice(*(segment.first_stored - (-each // world.stride) for each in (s, end)))
             self.mode_count[at] = np.bincount(told.mode, minlength=len(Mode))
             self.mode[at] = told.mode[world.stored]
-            _kernels.advance(
+            advance(
                 self.loop, self.law, *drives, world.table,
                 segment.first, s, end, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
                 told.age, true, field.constant, field.lean_rad, heat, self.model, cov, _FREE, _SCALE, walk, sun,

@@ -25,9 +25,9 @@ class AlarmWatch:
     Attributes
     ----------
     found
-        What came of past alarms: ``alarm``, ``at_s`` (after the day's first step), ``below_tenth_s``, ``off_s`` (last mirror below a
-        tenth of its own light), ``stowed_median_s``, ``stowed_s`` (last mirror), all after the alarm; None: not within
-        half an hour or the day. Mirrors without power, or without valid counts, are not waited for.
+        What came of past alarms: ``alarm``, ``at_s`` (after the day's first step), ``below_tenth_s``, ``off_s`` (last
+        mirror below a tenth of its own light), ``stowed_median_s``, ``stowed_s`` (last mirror), all after the alarm;
+        None: not within half an hour or the day. Mirrors without power, or without valid counts, are not waited for.
     """
 
     def __init__(self, n: int) -> None:

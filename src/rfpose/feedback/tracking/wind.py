@@ -109,6 +109,11 @@ class Gusts:
                     "`first_hour` and `last_hour` within it"
                 )
 
+    @property
+    def recorded(self) -> bool:
+        """Whether the wind is that of a record."""
+        return self._record is not None
+
     def draw_swing(self, rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
         """Return what excites the swing of mirrors (*shape, 4), of variance one; of a stiff structure nothing."""
         return rng.standard_normal((*shape, 4) if self.swings else (*shape[:-1], 0, 4), dtype=np.float32)
