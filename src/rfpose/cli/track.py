@@ -140,6 +140,12 @@ def command(
     )
     say("  rms, 95 % and worst of all mirrors and seconds; budget: the rms foreseen without simulating; part of a")
     say("  perfect tracker's light caught, light caught by a square metre of mirror; motor steps a mirror and day")
+    bears = summary["margins"]
+    if bears is not None:
+        say(
+            f"  radio loop: gain margin {bears['gain']:.1f}, phase margin {bears['phase_deg']:.0f} degrees; bears "
+            f"{bears['more_latency_s']:.0f} s more latency, intervals up to {bears['longest_interval_s']:.0f} s"
+        )
     for each in summary["iq"]:
         say(
             f"  {each['heliostat']} from samples: {each['solved']} of {each['postures']} postures, "

@@ -18,7 +18,9 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import RecordingError, ScenarioError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
+from rfpose.feedback.tracking._kernels import RADIO
 from rfpose.feedback.tracking.budget import track_budget
+from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.scenario import Scenario, parse_scenario
@@ -139,6 +141,18 @@ class Track:
         """Return the methods' names, the one that catches most light first."""
         return sorted(self.methods, key=lambda name: -(self.methods[name].summary["intercept"] or 0.0))
 
+    def _margins(self) -> dict[str, float] | None:
+        """Return what the radio loop bears until it oscillates; None without radio in a loop."""
+        if not any(METHODS[name].feedback == RADIO for name in self.methods if name in METHODS):
+            return None
+        found = loop_margins_of(self.scenario)
+        return {
+            "gain": found.gain,
+            "phase_deg": float(np.rad2deg(found.phase_rad)),
+            "more_latency_s": found.latency_s,
+            "longest_interval_s": found.interval_s,
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return the run's summary with stable keys."""
         return {
@@ -147,6 +161,7 @@ class Track:
             "days": list(self.dates),
             "seed": int(self.settings["seed"]),
             "iq": [dict(each) for each in self.iq],
+            "margins": self._margins(),
             "ranking": self.ranking(),
             "methods": {
                 name: dict(method.summary) | ({"field_control": list(method.happened)} if method.happened else {})

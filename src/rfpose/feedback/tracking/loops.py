@@ -18,7 +18,7 @@ from rfpose.feedback.tracking.timeline import site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
 
-__all__ = ["check_gains", "drive_numbers", "loop_margins", "loop_numbers"]
+__all__ = ["check_gains", "drive_numbers", "loop_margins", "loop_margins_of", "loop_numbers"]
 
 _FORGET_OFFSET_S = 300.0
 _EARTH_RADPS = 7.2921159e-5
@@ -47,6 +47,19 @@ def loop_margins(
     return margins(law, structure, interval_s=interval_s, latency_s=beyond * interval_s)
 
 
+def loop_margins_of(scenario: Scenario) -> Margins:
+    """Return the margins of the scenario's radio loop."""
+    plan = scenario.tracking
+    mode = plan.structure
+    return loop_margins(
+        plan.radio.gain_per_s,
+        plan.radio.integral_gain_per_s2,
+        interval_s=plan.control_interval_s,
+        latency_s=plan.radio.latency_s,
+        structure=Structure(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None,
+    )
+
+
 def check_gains(scenario: Scenario) -> Margins:
     """Return the margins of the scenario's radio loop.
 
@@ -55,15 +68,7 @@ def check_gains(scenario: Scenario) -> Margins:
     InvalidInputError
         They are less than quantisation asks for, and ``force_gains`` is not set.
     """
-    plan = scenario.tracking
-    mode = plan.structure
-    found = loop_margins(
-        plan.radio.gain_per_s,
-        plan.radio.integral_gain_per_s2,
-        interval_s=plan.control_interval_s,
-        latency_s=plan.radio.latency_s,
-        structure=Structure(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None,
-    )
+    plan, found = scenario.tracking, loop_margins_of(scenario)
     if not plan.radio.force_gains and not (found.stable and found.gain >= LEAST_GAIN_MARGIN):
         raise InvalidInputError(
             f"[tracking.radio] the gains leave a gain margin of {found.gain:.2f} and a phase margin of "
