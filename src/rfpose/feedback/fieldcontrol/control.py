@@ -238,6 +238,11 @@ class FieldControl:
         return np.asarray(self._wire.pending != NOTHING)
 
     @property
+    def centre_dead(self) -> bool:
+        """Whether the centre orders nothing, until it is repaired."""
+        return self._centre_lost_s is not None
+
+    @property
     def alarms(self) -> tuple[str, ...]:
         """What keeps the centre from other orders than stow."""
         return tuple(self._alarms)

@@ -763,11 +763,7 @@ class _Budgeter:
         for source in self._sources(day, course, looks, since):
             error = np.zeros((*course.count.shape[:2], 3)) if source.track is None else source.track
             if gain is not None and known is not None and source.look is not None:
-                error = (
-                    error - np.einsum("mtxf,mflx,mly->mtx", known, gain, source.look[..., :, :])
-                    if False
-                    else (error - np.einsum("mtxf,mf->mtx", known, np.einsum("mfly,mly->mf", gain, source.look)))
-                )
+                error = error - np.einsum("mtxf,mf->mtx", known, np.einsum("mfly,mly->mf", gain, source.look))
             self._add(source.part, np.where(course.seen, np.sum(error**2, axis=-1), np.nan))
         if gain is not None and looks is not None and known is not None:
             self._add("fit", self._scatter(course, looks, known, gain))

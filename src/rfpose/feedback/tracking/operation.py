@@ -127,7 +127,6 @@ class Operation:
         self.campaign = Campaign(scenario, field, feedback=feedback, seed=seed)
         self.watch = AlarmWatch(n)
         self._out = np.ones(n, np.bool_)
-        self._centre_dead = False
         self._next_event = 0
         self._last_duty = np.full(n, -1, np.int64)
         self._last_aim = np.full((n, 3), np.nan)
@@ -294,7 +293,7 @@ class Operation:
 
     def _programme(self, s: int) -> None:
         """Send mirrors out by day and into stow when the day is over."""
-        if self._centre_dead:
+        if self.control.centre_dead:
             return
         reported, free = self.control.reported_mode, ~self.control.waiting
         if s > self._works_until:
@@ -329,11 +328,10 @@ class Operation:
         if event.what == "calibrate":
             self.campaign.queue(np.flatnonzero(who))
         elif event.what in ("emergency", "release", "centre-fails", "centre-returns"):
-            if self._centre_dead and event.what == "emergency":
+            if control.centre_dead and event.what == "emergency":
                 return {"the centre is dead": len(who)}
             {"emergency": control.emergency, "release": control.release, "centre-fails": control.fail_centre,
              "centre-returns": control.repair_centre}[event.what]()  # fmt: skip
-            self._centre_dead = {"centre-fails": True, "centre-returns": False}.get(event.what, self._centre_dead)
         elif event.what == "power-fails":
             control.power_off(who, axis_rad=axis_rad)
         elif event.what == "power-returns":
@@ -363,7 +361,7 @@ class Operation:
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return all that going on depends on."""
-        text = {"log": self.log, "next": self._next_event, "dead": self._centre_dead}
+        text = {"log": self.log, "next": self._next_event}
         text |= {"campaign": self.campaign.text(), "watch": self.watch.text(), "wind": self._wind_mps.past}
         own = {
             "out": self._out, "duty": self._last_duty, "aim": self._last_aim, "mode": self._last_mode,
@@ -382,7 +380,7 @@ class Operation:
         self._out, self._last_duty, self._last_aim = own["out"].copy(), own["duty"].copy(), own["aim"].copy()
         self._last_mode, self.homing_rad = own["mode"].copy(), own["homing"].copy()
         text = json.loads(bytes(own["text"]).decode())
-        self.log, self._next_event, self._centre_dead = text["log"], text["next"], text["dead"]
+        self.log, self._next_event = text["log"], text["next"]
         self.campaign.restore(text["campaign"])
         self._wind_mps.past = text["wind"]
         self.watch.restore(part("watch"), text["watch"])

@@ -36,7 +36,6 @@ class AlarmWatch:
         self._begin_s = 0.0
         self._below_s: float | None = None
         self._known: tuple[str, ...] = ()
-        self._now_s = 0.0
         self._full = np.zeros(n)
         self._off_s = np.full(n, np.nan)
         self._stowed_s = np.full(n, np.nan)
@@ -60,7 +59,7 @@ class AlarmWatch:
         for name in alarms:
             if name in _TO_STOW and name not in self._known:
                 self.begin(now_s, name, light)
-        self._known, self._now_s = tuple(alarms), now_s
+        self._known = tuple(alarms)
         if not self.open:
             return
         after = now_s - self._begin_s
@@ -97,7 +96,7 @@ class AlarmWatch:
         """Return what is no array, for `restore`."""
         return {
             "found": self.found, "name": self._name, "begin_s": self._begin_s, "below_s": self._below_s,
-            "known": self._known, "now_s": self._now_s,
+            "known": self._known,
         }  # fmt: skip
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
@@ -107,7 +106,7 @@ class AlarmWatch:
     def restore(self, arrays: Mapping[str, npt.NDArray[Any]], text: Mapping[str, Any]) -> None:
         """Go back to what `arrays` and `text` gave."""
         self.found, self._name = list(text["found"]), text["name"]
-        self._begin_s, self._below_s, self._now_s = text["begin_s"], text["below_s"], text["now_s"]
+        self._begin_s, self._below_s = text["begin_s"], text["below_s"]
         self._known = tuple(text["known"])
         self._full, self._able = arrays["full"].copy(), arrays["able"].copy()
         self._off_s, self._stowed_s = arrays["off_s"].copy(), arrays["stowed_s"].copy()
