@@ -97,11 +97,11 @@ def track(
             key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
     place = result_path.with_name(f".{result_path.name}.state")
     checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
+    state = checkpoint.read()
     try:
         iq = check_with_iq(scenario, check_iq, seed=seed)
     except InvalidInputError as error:
         raise ScenarioError(f"{scenario_path}: {error}") from error
-    state = checkpoint.read()
     if state is not None:
         simulation.restore(state)
     while simulation.done < simulation.n_segment:

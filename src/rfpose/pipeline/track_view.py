@@ -332,13 +332,11 @@ def groups(places: Sequence[float], least: float) -> list[list[int]]:
 
 def what_happened(track: Track, method: str) -> tuple[Happening, ...]:
     """Return what happened to a method's field, in the order of days and hours; empty without field control."""
-    hour = local_hour(track)
     found: list[Happening] = []
     for day, report in enumerate(track.methods[method].happened):
-        begin = float(hour[int(np.argmax(track.day == day))])
         agenda = [event for event in track.scenario.tracking.event if event.day in (None, day + 1)]
         timed = [_event(day, entry, agenda, len(track.heliostat_ids)) for entry in report["events"]]
-        timed += [_alarm(day, entry, begin + entry["at_s"] / 3600.0) for entry in report["alarms"]]
+        timed += [_alarm(day, entry) for entry in report["alarms"]]
         found += sorted(timed, key=lambda each: each.hour)
         found += [_calibration(day, entry) for entry in report["calibrations"]]
         found.append(_messages(day, report["messages"]))
@@ -373,7 +371,7 @@ def _mirrors(n: int) -> str:
     return "1 mirror" if n == 1 else f"{n} mirrors"
 
 
-def _alarm(day: int, entry: Mapping[str, Any], hour: float) -> Happening:
+def _alarm(day: int, entry: Mapping[str, Any]) -> Happening:
     parts = []
     for key, what in (
         ("below_tenth_s", "flux below a tenth"),
@@ -385,7 +383,7 @@ def _alarm(day: int, entry: Mapping[str, Any], hour: float) -> Happening:
         parts.append(f"{what} after {after:.0f} s" if after is not None else f"{what}: not within half an hour")
     late = any(entry[key] is None for key in ("below_tenth_s", "off_s", "stowed_s"))
     text = f"alarm, {entry['alarm']}: {', '.join(parts)}"
-    return Happening(day=day, hour=hour, kind="alarm", mark=entry["alarm"], text=text, trouble=late)
+    return Happening(day=day, hour=entry["hour"], kind="alarm", mark=entry["alarm"], text=text, trouble=late)
 
 
 def _calibration(day: int, entry: Mapping[str, Any]) -> Happening:
