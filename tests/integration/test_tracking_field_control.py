@@ -12,20 +12,11 @@ from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import Simulation, operation, score
 from rfpose.scenario import load_scenario
+from sites import PERFECT
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "tracking_100m.toml"
 
-PERFECT = {
-    "mount_errors": {
-        "tilt_sigma_mrad": 0.0, "zero_sigma_mrad": 0.0, "nonorthogonality_sigma_mrad": 0.0, "canting_sigma_mrad": 0.0,
-        "location_sigma_mm": 0.0, "worm_sigma_mrad": 0.0, "sag_sigma_mrad": 0.0, "thermal_sigma_mrad": 0.0,
-        "creep_sigma_mrad_per_month": 0.0,
-    },
-    "wind": {"deflection_mrad_per_mps2": (0.0, 0.0)},
-    "structure": {"natural_hz": 0.0},
-    "drive": {"backlash_mrad": (0.0, 0.0), "steps_per_turn": 480_000.0},
-    "radio": {"plate_sigma_mrad": 0.0, "ground": "none"},
-}  # fmt: skip
+FINE = PERFECT | {"drive": PERFECT["drive"] | {"steps_per_turn": 480_000.0}}
 """Nothing wrong but motor steps, and those of 0.013 mrad."""
 
 FULL_HOUR = {"first_hour": 11.5, "last_hour": 12.5, "store_interval_s": 4.0}
@@ -157,7 +148,7 @@ def between():
         ("carried-on", 20.0, 0.2),
     ):  # fmt: skip
         site = scenario(
-            PERFECT, HALF_HOUR, {"field_control": {"between_messages": how}}, control_interval_s=interval,
+            FINE, HALF_HOUR, {"field_control": {"between_messages": how}}, control_interval_s=interval,
             store_interval_s=interval, bus={"lost": lost},
         )  # fmt: skip
         found[how, interval, lost] = run(site)
@@ -203,7 +194,7 @@ def test_a_sun_that_is_carried_on_does_without_messages(between):
 
 def test_the_watchdog_takes_mirrors_off_and_the_programme_brings_them_back():
     site = scenario(
-        PERFECT, HALF_HOUR, {"field_control": {"watchdog_intervals": 2.0}, "settle_s": 0.0}, bus={"lost": 0.35}
+        FINE, HALF_HOUR, {"field_control": {"watchdog_intervals": 2.0}, "settle_s": 0.0}, bus={"lost": 0.35}
     )
     found = run(site)
     curves, trips = found.curves("open-loop"), happened(found)["messages"]["watchdog_emergencies"]
@@ -348,7 +339,7 @@ def test_an_emergency_that_nobody_can_order_is_no_alarm():
 
 @pytest.fixture(scope="module")
 def powerless():
-    site = scenario(PERFECT, HALF_HOUR, events=("11.65 power-fails", "11.85 power-returns"))
+    site = scenario(FINE, HALF_HOUR, events=("11.65 power-fails", "11.85 power-returns"))
     return run(site, ("open-loop",))
 
 
@@ -705,7 +696,7 @@ def test_wind_swings_mirrors_as_edwards_has_it():
 
     bend = (0.05, 0.1)
     stiff, soft = (
-        run(scenario(PERFECT, FULL_HOUR, without=True, structure={"natural_hz": hz},
+        run(scenario(FINE, FULL_HOUR, without=True, structure={"natural_hz": hz},
                      wind={"deflection_mrad_per_mps2": bend, "mean_speed_mps": 6.0}), count=8)
         for hz in (0.0, 2.2)
     )  # fmt: skip
@@ -727,7 +718,7 @@ def test_wind_swings_mirrors_as_edwards_has_it():
 def test_a_stopped_motor_leaves_the_mirror_ringing():
     hz, damping = 2.2, 0.02
     site = scenario(
-        PERFECT, {"first_hour": 11.5, "last_hour": 11.58, "control_interval_s": 1.0, "store_interval_s": 1.0},
+        FINE, {"first_hour": 11.5, "last_hour": 11.58, "control_interval_s": 1.0, "store_interval_s": 1.0},
         structure={"natural_hz": hz, "damping": damping}, wind={"mean_speed_mps": 0.0}, events=("11.51 stow",),
     )  # fmt: skip
     curves = run(site, count=2).curves("open-loop")

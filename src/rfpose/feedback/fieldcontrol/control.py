@@ -13,10 +13,11 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings, MessageStatus
-from rfpose.feedback.fieldcontrol.local import EARTH_RAD_S, NOTHING, Heliostats
+from rfpose.feedback.fieldcontrol.local import NOTHING, Heliostats
 from rfpose.feedback.fieldcontrol.modes import COMMANDS, Event, Mode, refusal
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, Messages, ModeArray, Orders, Reply
 from rfpose.feedback.fieldcontrol.wire import Wire
+from rfpose.feedback.servo.rules import EARTH_RADPS
 
 __all__ = ["FieldControl", "FieldSettings", "Messages", "Orders", "Reply"]
 
@@ -516,7 +517,7 @@ class FieldControl:
             return False
         # the sun as last sent out, which has moved since and will: twice that way, and a packet's last digit
         above = self._wire.round_sun_enu[2] - self._lowest_sine
-        margin = _SUN_MARGIN_RAD + 2.0 * EARTH_RAD_S * (until_s - self._wire.round_s)
+        margin = _SUN_MARGIN_RAD + 2.0 * EARTH_RADPS * (until_s - self._wire.round_s)
         return bool(abs(above) > margin)
 
 

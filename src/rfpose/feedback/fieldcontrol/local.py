@@ -8,13 +8,12 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import TABLE, Event, Mode, follow
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, ModeArray
+from rfpose.feedback.servo.rules import EARTH_RADPS
 
-__all__ = ["EARTH_RAD_S", "NOTHING", "Heliostats", "spiral_cells"]
+__all__ = ["NOTHING", "Heliostats", "spiral_cells"]
 
 NOTHING = -1
 """Stands for no event."""
-EARTH_RAD_S = 2.0 * np.pi / 86400.0
-"""How fast the sun moves over the sky at most [rad/s]."""
 
 
 def _modes(*members: Mode) -> BoolArray:
@@ -157,7 +156,7 @@ class Heliostats:
     def believe_sun(self, index: npt.NDArray[np.int64], sun_enu: FloatArray, said_s: float, *, fresh_s: float) -> None:
         """Take sun angles over, unless they are further from fresh ones than the sun moves."""
         age = said_s - self.sun_s[index]
-        farthest = self.settings.sun_jump_rad + EARTH_RAD_S * age
+        farthest = self.settings.sun_jump_rad + EARTH_RADPS * age
         step = np.sqrt(((sun_enu - self.sun_enu[index]) ** 2).sum(axis=1))
         ok = (step <= farthest) | ~(age <= fresh_s)
         if not ok.all():

@@ -10,6 +10,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo import PiLaw, Stepper
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
 from rfpose.feedback.servo.margins import LEAST_GAIN_MARGIN, Margins, margins
+from rfpose.feedback.servo.rules import EARTH_RADPS
 from rfpose.feedback.structure import Structure
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD
@@ -21,7 +22,6 @@ from rfpose.scenario import Scenario
 __all__ = ["check_gains", "drive_numbers", "loop_margins", "loop_margins_of", "loop_numbers"]
 
 _FORGET_OFFSET_S = 300.0
-_EARTH_RADPS = 7.2921159e-5
 
 
 def loop_margins(
@@ -139,7 +139,7 @@ def _sky(scenario: Scenario) -> dict[str, Any]:
     return {
         "pole_n": float(np.cos(site.latitude_rad)),
         "pole_u": float(np.sin(site.latitude_rad)),
-        "turn": _EARTH_RADPS * plan.servo_interval_s if carries else 0.0,
+        "turn": EARTH_RADPS * plan.servo_interval_s if carries else 0.0,
     }
 
 
