@@ -80,32 +80,161 @@ def test_turn_back_and_turn_are_inverse_rotations():
         np.testing.assert_allclose(found, (block[:, :2] + 1j * block[:, 2:]).T, atol=1e-12)
 
 
-def test_coherent_power_is_the_power_of_the_turned_sum():
+def test_most_coherent_is_where_lines_add_up():
     rng = np.random.default_rng(4)
-    stream = rng.standard_normal((3, 11)) + 1j * rng.standard_normal((3, 11))
-    slope, offset = np.array([0.01, -0.02, 0.005]), np.array([-3.0, 0.0, 1.5])
-    expected = [
-        np.sum(np.abs(np.sum(stream * np.exp(-2j * np.pi * d * np.outer(slope, np.arange(11))), axis=1)) ** 2)
-        for d in offset
-    ]
-    for _, found in both(_kernels.coherent_power, stream, slope, offset, np.empty(3)):
-        np.testing.assert_allclose(found, expected, rtol=1e-10)
+    slope, block, offset = np.array([0.01, -0.02, 0.005]), np.arange(40), 0.137
+    stream = np.exp(2j * np.pi * offset * np.outer(slope, block)) * np.array([[1.0], [2.0j], [-0.5]])
+    stream += 0.1 * (rng.standard_normal(stream.shape) + 1j * rng.standard_normal(stream.shape))
+
+    def power(ppm):
+        return np.sum(np.abs(np.sum(stream * np.exp(-2j * np.pi * ppm * np.outer(slope, block)), axis=1)) ** 2)
+
+    lines = np.zeros((6, 40), np.complex128)
+    lines[::2] = stream
+    for kernel in (_kernels.most_coherent, _kernels.most_coherent.py_func):
+        found, curvature, height, whole = kernel(lines, 2, 1, slope, 3, 0.2)
+        assert power(found) >= max(power(found + d) for d in (-0.01, -1e-3, 1e-3, 0.01))
+        assert height == pytest.approx(power(found), rel=1e-10)
+        assert whole == pytest.approx(40 * np.sum(np.abs(stream) ** 2))
+        bend = (power(found + 0.02) - 2.0 * power(found) + power(found - 0.02)) / 0.02**2
+        assert curvature == pytest.approx(-0.5 * bend, rel=1e-3)
+
+
+def sums_of_unit_line(cycle, back, template, hop, n_sample, start=0.0):
+    """Block sums of a line of amplitude one: inside each block by the template, blocks turned back by ``back``."""
+    n = np.arange(n_sample)
+    line = np.exp(2j * np.pi * cycle * (n - start))
+    return np.sum(line * np.exp(-2j * np.pi * template * (n % hop)) * np.exp(-2j * np.pi * back * hop * (n // hop)))
 
 
 @pytest.mark.parametrize("n_tail", [0, 5])
-def test_gram_is_the_response_to_unit_lines(n_tail):
+def test_leakage_is_what_unit_lines_add_to_each_other(n_tail):
     cycles = np.array([0.101, 0.13, -0.31])
     template = np.array([0.1, 0.1299, -0.3102])
-    shift, hop, n_block, centre = 0.0004, 16, 6, 50.0
-    n_sample = hop * n_block + n_tail
-    n = np.arange(n_sample)
-    expected = np.empty((3, 3), complex)
-    for a in range(3):
-        for b in range(3):
-            x = np.exp(2j * np.pi * cycles[b] * (n - centre))
-            inside = np.exp(-2j * np.pi * (shift + template[a]) * (n % hop))
-            between = np.exp(-2j * np.pi * cycles[a] * hop * (n // hop))
-            expected[a, b] = np.sum(x * inside * between)
-    out = np.empty((3, 3), np.complex128)
-    for _, found in both(_kernels.gram, cycles, template, shift, hop, n_block, n_tail, centre, out):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+    shift, hop, n_block, n_group = 0.0004, 16, 6, 2
+    arguments = cycles, template, shift, hop, n_block, n_tail, n_group
+    whole, group = (
+        np.array(
+            [[sums_of_unit_line(c, cycles[a], shift + template[a], hop, length) for c in cycles] for a in range(3)]
+        )
+        for length in (hop * n_block + n_tail, hop * n_group)
+    )
+    for kernel in (_kernels.leakage, _kernels.leakage.py_func):
+        found_whole, found_group = np.empty((2, 3, 3), np.complex128)
+        kernel(*arguments, found_whole, found_group)
+        np.testing.assert_allclose(found_whole, whole / np.diag(whole), atol=1e-11)
+        np.testing.assert_allclose(found_group, group / np.diag(group), atol=1e-11)
+
+
+def test_model_and_residual_of_known_lines():
+    cycles, template = np.array([0.1003, -0.2401]), np.array([0.1, -0.24])
+    hop, n_block, n_tail, n_group = 20, 8, 7, 2
+    n_sample, amplitude = hop * n_block + n_tail, np.array([2.0 - 1.0j, 0.5j])
+    centre = 0.5 * (n_sample - 1)
+    whole, group = np.empty((2, 2, 2), np.complex128)
+    _kernels.leakage(cycles, template, 0.0, hop, n_block, n_tail, n_group, whole, group)
+    at_start = amplitude * np.exp(-2j * np.pi * cycles * centre)
+    inverse = np.linalg.inv(whole)
+    # sums of groups as the bank gives them
+    n, samples = np.arange(n_sample), (at_start @ np.exp(2j * np.pi * np.outer(cycles, np.arange(n_sample))))
+    turned = samples * np.exp(-2j * np.pi * (template[:, None] * (n % hop) + cycles[:, None] * hop * (n // hop)))
+    stream = turned[:, : hop * n_block].reshape(2, n_block // n_group, -1).sum(axis=2)
+    model = np.empty((2, 4), np.complex128)
+    own, found = np.empty((2, 2), np.complex128)
+    for kernel, moments in (
+        (_kernels.model_of_lines, _kernels.residual_moments),
+        (_kernels.model_of_lines.py_func, _kernels.residual_moments.py_func),
+    ):
+        arguments = hop, n_block, n_tail, n_group, centre, found, own, model
+        kernel(turned.sum(axis=1), inverse, cycles, cycles - template, *arguments)
+        np.testing.assert_allclose(found, amplitude, atol=1e-12)
+        unit = [sums_of_unit_line(c, c, t, hop, n_sample) for c, t in zip(cycles, template, strict=True)]
+        np.testing.assert_allclose(own, unit, atol=1e-9)
+        leaked, span, scatter = group @ model, hop * n_group, np.empty(2)
+        slope = 2.0 * np.pi * np.array([1e-4, -2e-4]) * model[:, 0]
+        first = 0.5 * span - 0.5 - centre
+        step, _ = moments(stream, leaked, cycles * span, slope, first, span, scatter)
+        np.testing.assert_allclose(scatter, 0.0, atol=1e-18)
+        assert step == pytest.approx(0.0, abs=1e-9)
+        # lines that turn by what a hundredth of a ppm makes ask for just that
+        back = np.exp(-2j * np.pi * np.outer(cycles * span, np.arange(4)))
+        lever = first + span * np.arange(4)
+        moved = stream + 0.01j * (slope[:, None] * lever)
+        step, power = moments(moved, leaked, cycles * span, slope, first, span, scatter)
+        assert step == pytest.approx(0.01, rel=1e-6)
+        assert power == pytest.approx(np.sum(np.abs(slope) ** 2) * np.sum(lever**2))
+        # after that step nothing is left but rounding
+        assert np.max(scatter) < 1e-9 * np.sum(np.abs(moved - leaked * back) ** 2)
+
+
+def test_smooth_variance_leaves_a_disturbed_line_its_own():
+    disturbed = np.random.default_rng(6).chisquare(60.0, 30) / 60.0
+    disturbed[4] = 50.0
+    for _, out in both(_kernels.smooth_variance, disturbed, 60.0, np.empty(30)):
+        assert out[4] > 25.0
+        assert np.max(np.delete(out, 4)) < 2.0
+
+
+def test_analytic_tones_and_their_mean_phasor():
+    rng = np.random.default_rng(7)
+    line = rng.standard_normal((10, 6)) + 1j * rng.standard_normal((10, 6))  # two transmitters, two tones
+    by_transmitter = line.reshape(2, 5, 6)
+    back = by_transmitter[:, :1].conj() / np.abs(by_transmitter[:, :1])
+    expected = by_transmitter[:, 1::2] * back + (by_transmitter[:, 2::2] * back).conj()
+    for _, found in both(_kernels.analytic_tones, line, 2, np.empty((2, 2, 6), np.complex128)):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    unit = np.mean(expected / np.abs(expected), axis=-1)
+    for _, found in both(_kernels.mean_unit_phasor, expected, np.empty((2, 2), np.complex128)):
+        np.testing.assert_allclose(found, unit, atol=1e-12)
+
+
+def test_filtered_lines_are_means_and_scatter():
+    rng = np.random.default_rng(8)
+    stream = rng.standard_normal((3, 7)) + 1j * rng.standard_normal((3, 7))
+    to_centre = np.array([1.0, 1.0j, 0.5 - 0.5j])
+    line = stream * to_centre[:, None]
+    for kernel in (_kernels.filtered_lines, _kernels.filtered_lines.py_func):
+        own, amplitude, scatter = stream.copy(), np.empty(3, np.complex128), np.empty(3)
+        kernel(own, to_centre, amplitude, scatter)
+        np.testing.assert_allclose(own, line)
+        np.testing.assert_allclose(amplitude, line.mean(axis=1))
+        np.testing.assert_allclose(scatter, np.mean(np.abs(line - line.mean(axis=1)[:, None]) ** 2, axis=1))
+
+
+def test_tone_quality_marks_weak_tones_and_absent_carriers():
+    amplitude = np.array([[10.0, 3.0, 3.0], [10.0j, 3.0, 3.0], [1.0, 3.0, 3.0]], np.complex128)
+    variance = np.full((3, 3), 0.5)
+    tone = np.array([[6.0], [-2.0j], [6.0]], np.complex128)
+    for kernel in (_kernels.tone_quality, _kernels.tone_quality.py_func):
+        phase, sigma, status = np.ones((3, 1)), np.empty((3, 1)), np.zeros(3, np.uint8)
+        kernel(amplitude, variance, tone, np.full((3, 1), 0.01), 25.0, 8.0, 1, 2, phase, sigma, status)
+        np.testing.assert_array_equal(status, [0, 2, 1])
+        np.testing.assert_array_equal(phase[:, 0], [1.0, np.nan, np.nan])
+        np.testing.assert_allclose(sigma[:, 0], [np.sqrt(0.5 / 36.0 + 0.01), np.nan, np.nan])
+
+
+@pytest.mark.parametrize("n_fold", [4, 5])
+def test_flat_fold_turns_rows_and_inspects(n_fold):
+    rng = np.random.default_rng(9)
+    period, n_block, n_tail, shift = 8, 3, 5, 0.013
+    samples = rng.integers(-1000, 1000, (period * n_fold * n_block + n_tail, 2)).astype(np.int16)
+    samples[3] = 2000, 0
+    samples[40] = -32768, -32768
+    samples[64:80] = 0
+    samples[-1] = 0, -3000
+    x = samples[:, 0] + 1j * samples[:, 1].astype(float)
+    row = np.exp(-2j * np.pi * shift * period * np.arange(n_fold)) * 2.0**-16
+    ramp = np.exp(-2j * np.pi * shift * np.arange(period))
+    turned = x[: period * n_fold * n_block].reshape(n_block, n_fold, period) * (row[:, None] * ramp * 2.0**16)
+    expected = turned.sum(axis=1)
+    turns = [part.astype(np.float32) for z in (row, ramp) for part in (z.real, z.imag)]
+    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *turns, n_block, np.int16(2000), 16
+    for found, out in both(_kernels.fold_flat_i16, *arguments, np.empty((n_block, 2 * period), np.float32)):
+        assert found == (2, 1, 16)
+        np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+
+
+def test_smooth_variance_of_equal_lines_is_their_mean():
+    variance = np.array([1.0, 1.01, 0.99, 1.0])
+    for _, out in both(_kernels.smooth_variance, variance, 60.0, np.empty(4)):
+        np.testing.assert_allclose(out, variance.mean())

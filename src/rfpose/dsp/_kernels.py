@@ -53,22 +53,6 @@ def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
             im[j] += i * gi[j] + q * gr[j]
 
 
-@kernel_fast
-def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
-    """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
-    n_tap = n_fold * period
-    for k in range(n_block):
-        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
-
-
-@kernel_fast
-def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
-    """Like `fold_i16` for (sample,) complex64."""
-    n_tap = n_fold * period
-    for k in range(n_block):
-        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
-
-
 @kernel
 def _extremes_i16(flat):
     """Return the smallest and the largest component of a short stretch."""
@@ -98,6 +82,112 @@ def _count_i16(flat, limit):
     return n_clip, n_fill
 
 
+@kernel_inline
+def _add_row_i16(x, a, c, re, im):
+    """Add one row of samples turned by a + jc; ``a`` and ``c`` carry a factor 2⁻¹⁶.
+
+    I and Q are left in the upper half of 32 bits, where they need a shift or a mask less than in the lower.
+    """
+    for j in range(x.size):
+        v = x[j]
+        i = np.float32(np.int32(v << np.int32(16)))
+        q = np.float32(np.int32(v & np.int32(-65536)))
+        re[j] += i * a - q * c
+        im[j] += i * c + q * a
+
+
+@kernel_inline
+def _add_two_rows_i16(x0, x1, a0, c0, a1, c1, re, im):
+    """Like `_add_row_i16` for two rows: the sums are loaded and stored half as often."""
+    for j in range(x0.size):
+        v0 = x0[j]
+        v1 = x1[j]
+        i0 = np.float32(np.int32(v0 << np.int32(16)))
+        q0 = np.float32(np.int32(v0 & np.int32(-65536)))
+        i1 = np.float32(np.int32(v1 << np.int32(16)))
+        q1 = np.float32(np.int32(v1 & np.int32(-65536)))
+        re[j] += (i0 * a0 - q0 * c0) + (i1 * a1 - q1 * c1)
+        im[j] += (i0 * c0 + q0 * a0) + (i1 * c1 + q1 * a1)
+
+
+@kernel_fast
+def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, out):
+    """Fold and inspect in one pass over memory: blocks side by side, each row of a period turned as a whole.
+
+    ``flat`` (2·sample,) int16 and ``pair`` (sample,) int32 are the same samples; ``row_re``, ``row_im`` (fold,)
+    turn row by row and carry a factor 2⁻¹⁶, ``ramp_re``, ``ramp_im`` (period,) turn what is left inside a row.
+    ``out`` (block, 2·period). Returns (clipped, fill, samples in all-zero segments), of the whole frame.
+    """
+    n_fold = row_re.size
+    period = ramp_re.size
+    n_sample = pair.size
+    clipped = 0
+    fill = 0
+    zero = 0
+    looked = 0
+    for k in range(n_block):
+        for j in range(2 * period):
+            out[k, j] = 0.0
+        re = out[k, :period]
+        im = out[k, period:]
+        for r in range(0, n_fold, 2):
+            first = (k * n_fold + r) * period
+            end = first + 2 * period
+            while looked < min(end, n_sample):
+                ahead = min(looked + segment, n_sample)
+                c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
+                clipped += c
+                fill += f
+                zero += z
+                looked = ahead
+            x = pair[first : first + period]
+            if r + 1 < n_fold:
+                after = pair[first + period : end]
+                _add_two_rows_i16(x, after, row_re[r], row_im[r], row_re[r + 1], row_im[r + 1], re, im)
+            else:
+                _add_row_i16(x, row_re[r], row_im[r], re, im)
+        for j in range(period):
+            turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
+            im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
+            re[j] = turned
+    while looked < n_sample:
+        ahead = min(looked + segment, n_sample)
+        c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
+        clipped += c
+        fill += f
+        zero += z
+        looked = ahead
+    return clipped, fill, zero
+
+
+@kernel_fast
+def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
+    """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
+    n_tap = n_fold * period
+    for k in range(n_block):
+        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+
+
+@kernel_fast
+def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
+    """Like `fold_i16` for (sample,) complex64."""
+    n_tap = n_fold * period
+    for k in range(n_block):
+        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+
+
+@kernel
+def _inspect_segment_i16(part, limit):
+    """Return (clipped, fill, samples of a stretch that is all zero) of a short stretch of I and Q."""
+    lowest, highest = _extremes_i16(part)
+    if highest >= limit or lowest <= -limit:
+        clipped, fill = _count_i16(part, limit)
+        return clipped, fill, 0
+    if lowest == 0 and highest == 0:
+        return 0, 0, part.size // 2
+    return 0, 0, 0
+
+
 @kernel
 def inspect_i16(flat, limit, segment):
     """Return (clipped, fill, samples in all-zero segments); ``limit`` is full scale in counts."""
@@ -105,14 +195,10 @@ def inspect_i16(flat, limit, segment):
     fill = 0
     zero = 0
     for first in range(0, flat.size, 2 * segment):
-        part = flat[first : min(first + 2 * segment, flat.size)]
-        lowest, highest = _extremes_i16(part)
-        if highest >= limit or lowest <= -limit:
-            n_clip, n_fill = _count_i16(part, limit)
-            clipped += n_clip
-            fill += n_fill
-        elif lowest == 0 and highest == 0:
-            zero += part.size // 2
+        c, f, z = _inspect_segment_i16(flat[first : min(first + 2 * segment, flat.size)], limit)
+        clipped += c
+        fill += f
+        zero += z
     return clipped, fill, zero
 
 
@@ -139,30 +225,64 @@ def inspect_f32(flat, limit, segment):
     return clipped, bad, zero
 
 
-@kernel_fast
-def coherent_power(stream, cycles_per_ppm_hop, offset_ppm, out):
-    """Power of every line added up over blocks, for each candidate clock offset.
-
-    ``stream`` (line, block) already turned back by the nominal frequencies, ``cycles_per_ppm_hop`` (line,) cycles a
-    line turns a block for one ppm, ``out`` (candidate,).
-    """
+@kernel_inline
+def _power_at(stream, cycles_hop, offset):
+    """Power of every line added up over blocks, turned back by ``offset`` times ``cycles_hop`` a block."""
     n_line, n_block = stream.shape
-    for c in range(offset_ppm.size):
-        total = 0.0
-        for m in range(n_line):
-            angle = -2.0 * math.pi * cycles_per_ppm_hop[m] * offset_ppm[c]
-            sr = math.cos(angle)
-            si = math.sin(angle)
-            # Horner's rule from the last block back: one complex multiply-add a block
-            ar = 0.0
-            ai = 0.0
-            for k in range(n_block - 1, -1, -1):
-                z = stream[m, k]
-                t = ar * sr - ai * si + z.real
-                ai = ar * si + ai * sr + z.imag
-                ar = t
-            total += ar * ar + ai * ai
-        out[c] = total
+    total = 0.0
+    for m in range(n_line):
+        angle = -2.0 * math.pi * cycles_hop[m] * offset
+        sr = math.cos(angle)
+        si = math.sin(angle)
+        # Horner's rule from the last block back: one complex multiply-add a block
+        ar = 0.0
+        ai = 0.0
+        for k in range(n_block - 1, -1, -1):
+            z = stream[m, k]
+            t = ar * sr - ai * si + z.real
+            ai = ar * si + ai * sr + z.imag
+            ar = t
+        total += ar * ar + ai * ai
+    return total
+
+
+@kernel_fast
+def most_coherent(stream, every, n_group, cycles_per_ppm_hop, n_side, step):
+    """Offset [ppm] at which carriers add up to most power: the best of ±``n_side`` steps, then two parabolas.
+
+    ``stream`` (line, block) already turned back by the nominal frequencies, of which each ``every``-th line is a
+    carrier and ``n_group`` blocks are added up first; ``cycles_per_ppm_hop`` (carrier,) cycles it turns a group for
+    one ppm. Returns the offset, minus half the second derivative there (NaN: no maximum), the power there, and the
+    power if all groups added up.
+    """
+    n_part = stream.shape[1] // n_group
+    carrier = np.zeros((cycles_per_ppm_hop.size, n_part), np.complex128)
+    incoherent = 0.0
+    for m in range(carrier.shape[0]):
+        for k in range(n_part):
+            for i in range(n_group):
+                carrier[m, k] += stream[m * every, k * n_group + i]
+            incoherent += carrier[m, k].real ** 2 + carrier[m, k].imag ** 2
+    offset = 0.0
+    best = -1.0
+    for c in range(-n_side, n_side + 1):
+        power = _power_at(carrier, cycles_per_ppm_hop, c * step)
+        if power > best:
+            best = power
+            offset = c * step
+    curvature = math.nan
+    small = 0.1 * step
+    if n_part > 1:
+        for _ in range(2):
+            below = _power_at(carrier, cycles_per_ppm_hop, offset - small)
+            here = _power_at(carrier, cycles_per_ppm_hop, offset)
+            above = _power_at(carrier, cycles_per_ppm_hop, offset + small)
+            bend = below - 2.0 * here + above
+            if not bend < 0.0:
+                break
+            offset -= 0.5 * small * (above - below) / bend
+            curvature = -0.5 * bend / small**2
+    return offset, curvature, _power_at(carrier, cycles_per_ppm_hop, offset), incoherent * n_part
 
 
 @kernel
@@ -184,28 +304,203 @@ def _phasor(cycles):
     return complex(math.cos(angle), math.sin(angle))
 
 
+@kernel_inline
+def _phasors(cycles_hop, n_block, out):
+    """exp(j2π·cycles_hop·k) for k = 0 … n_block−1, by four recurrences that do not wait for each other."""
+    one = _phasor(cycles_hop)
+    step = _phasor(4.0 * cycles_hop)
+    p0 = complex(1.0, 0.0)
+    p1 = one
+    p2 = one * one
+    p3 = p2 * one
+    whole = n_block - n_block % 4
+    for k in range(0, whole, 4):
+        out[k] = p0
+        out[k + 1] = p1
+        out[k + 2] = p2
+        out[k + 3] = p3
+        p0 *= step
+        p1 *= step
+        p2 *= step
+        p3 *= step
+    for k in range(whole, n_block):
+        out[k] = p0
+        p0 *= one
+
+
 @kernel
 def turn_back(block, cycles_hop, out):
     """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128."""
     n_line, n_block = out.shape
+    phasor = np.empty(n_block, np.complex128)
     for m in range(n_line):
-        step = _phasor(-cycles_hop[m])
-        phasor = complex(1.0, 0.0)
+        _phasors(-cycles_hop[m], n_block, phasor)
         for k in range(n_block):
-            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor
-            phasor *= step
+            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor[k]
 
 
 @kernel
 def turn(stream, cycles_hop, out):
     """Turn (line, block) on by ``cycles_hop`` a block."""
     n_line, n_block = out.shape
+    phasor = np.empty(n_block, np.complex128)
     for m in range(n_line):
-        step = _phasor(cycles_hop[m])
-        phasor = complex(1.0, 0.0)
+        _phasors(cycles_hop[m], n_block, phasor)
         for k in range(n_block):
-            out[m, k] = stream[m, k] * phasor
-            phasor *= step
+            out[m, k] = stream[m, k] * phasor[k]
+
+
+@kernel
+def model_of_lines(sums, inverse, cycles, inside_cycles, hop, n_block, n_tail, n_group, centre, amplitude, own, model):
+    """Amplitudes of all lines from their sums over a frame, and what each adds to each group of blocks.
+
+    ``inverse`` takes the leakage off ``sums``; ``inside_cycles`` is how fast a line turns against its template.
+    ``amplitude`` (line,) has its phase at ``centre``, ``own`` (line,) is the frame's response to a line of amplitude
+    one, ``model`` (line, group) in absolute time.
+    """
+    n_line, n_part = model.shape
+    phasor = np.empty(n_part, np.complex128)
+    for a in range(n_line):
+        total = 0.0j
+        for b in range(n_line):
+            total += inverse[a, b] * sums[b]
+        block = dirichlet(inside_cycles[a], hop)
+        own[a] = block * n_block + dirichlet(inside_cycles[a], n_tail)
+        at_start = total / own[a]
+        amplitude[a] = at_start * _phasor(cycles[a] * centre)
+        first = at_start * block * n_group
+        _phasors(cycles[a] * hop * n_group, n_part, phasor)
+        for k in range(n_part):
+            model[a, k] = first * phasor[k]
+
+
+@kernel
+def residual_moments(stream, model, cycles_span, slope, first_middle, span, scatter):
+    """Power that ``model`` leaves of ``stream`` (line, group) at each line, and how it asks the clock to move.
+
+    The model is in absolute time, the stream turned back by ``cycles_span`` a group. ``slope`` (line,) is what a ppm
+    adds to the first group for each sample from the centre; groups' middles lie ``first_middle`` + k·``span`` from it.
+    ``scatter`` (line,) sums squares as they are after the step. Returns the Gauss-Newton step [ppm] and its weight.
+    """
+    n_line, n_part = stream.shape
+    phasor = np.empty(n_part, np.complex128)
+    along = np.empty(n_line)
+    weight = np.empty(n_line)
+    lever = 0.0
+    for k in range(n_part):
+        lever += (first_middle + k * span) ** 2
+    for m in range(n_line):
+        _phasors(-cycles_span[m], n_part, phasor)
+        square = 0.0
+        moment = 0.0j
+        for k in range(n_part):
+            left = stream[m, k] - model[m, k] * phasor[k]
+            square += left.real * left.real + left.imag * left.imag
+            moment += left * (first_middle + k * span)
+        scatter[m] = square
+        along[m] = (slope[m].conjugate() * moment).imag
+        weight[m] = (slope[m].real ** 2 + slope[m].imag ** 2) * lever
+    power = weight.sum()
+    step = along.sum() / power if power > 0.0 else 0.0
+    for m in range(n_line):
+        scatter[m] = max(scatter[m] - 2.0 * step * along[m] + step * step * weight[m], 0.0)
+    return step, power
+
+
+@kernel
+def smooth_variance(variance, dof, out):
+    """Draw variances towards their typical value as far as their own scatter allows; see `dsp.correlator`."""
+    n = variance.size
+    pooled = 0.0
+    for m in range(n):
+        pooled += variance[m] / n
+        out[m] = variance[m]
+    if not pooled > 0.0 or n < 3:
+        return
+    log_ratio = np.empty(n)
+    for m in range(n):
+        log_ratio[m] = math.log(max(variance[m], 1e-300))
+    excess = log_ratio.var() * n / (n - 1) - 2.0 / dof
+    if excess <= 0.0:
+        out[:] = pooled
+        return
+    prior_dof = 2.0 / excess
+    typical = math.exp(np.median(log_ratio))
+    for m in range(n):
+        out[m] = (prior_dof * typical + dof * variance[m]) / (prior_dof + dof)
+
+
+@kernel
+def filtered_lines(stream, to_centre, amplitude, scatter):
+    """Refer (line, block) to the frame's centre in place; each line's mean and mean square distance from it."""
+    n_line, n_block = stream.shape
+    for m in range(n_line):
+        total = 0.0j
+        for k in range(n_block):
+            stream[m, k] *= to_centre[m]
+            total += stream[m, k]
+        mean = total / n_block
+        square = 0.0
+        for k in range(n_block):
+            left = stream[m, k] - mean
+            square += left.real * left.real + left.imag * left.imag
+        amplitude[m] = mean
+        scatter[m] = square / n_block
+
+
+@kernel
+def _analytic(carrier, upper, lower):
+    """Return U C*/|C| + (L C*/|C|)*, the analytic tone."""
+    back = carrier.conjugate() / math.hypot(carrier.real, carrier.imag)
+    return upper * back + (lower * back).conjugate()
+
+
+@kernel
+def analytic_tones(line, n_tone, out):
+    """(transmitter, tone, block) analytic tones of (transmitter × line, block) amplitudes."""
+    n_transmitter, _, n_block = out.shape
+    n_own = 1 + 2 * n_tone
+    for i in range(n_transmitter):
+        for q in range(n_tone):
+            for k in range(n_block):
+                out[i, q, k] = _analytic(
+                    line[i * n_own, k], line[i * n_own + 1 + 2 * q, k], line[i * n_own + 2 + 2 * q, k]
+                )
+
+
+@kernel
+def mean_unit_phasor(tone, out):
+    """Mean over the last axis of (transmitter, tone, block) phasors brought to length one."""
+    n_transmitter, n_tone, n_block = tone.shape
+    for i in range(n_transmitter):
+        for q in range(n_tone):
+            total = 0.0j
+            for k in range(n_block):
+                z = tone[i, q, k]
+                total += z / math.hypot(z.real, z.imag)
+            out[i, q] = total / n_block
+
+
+@kernel
+def tone_quality(amplitude, variance, tone, added, least_carrier, least_tone, absent, weak, phase, sigma, status):
+    """Sigma of each tone's phase; NaN, with a status, where the tone or its carrier is too weak to have one.
+
+    ``amplitude`` and ``variance`` (transmitter, line): carrier, then upper and lower sideband of each tone; ``tone``,
+    ``added`` variance, ``phase``, ``sigma`` (transmitter, tone). ``status`` holds 0 already.
+    """
+    n_transmitter, n_tone = tone.shape
+    for i in range(n_transmitter):
+        for q in range(n_tone):
+            noise = variance[i, 1 + 2 * q] + variance[i, 2 + 2 * q]
+            power = tone[i, q].real ** 2 + tone[i, q].imag ** 2
+            sigma[i, q] = math.sqrt(0.5 * noise / power + added[i, q])
+            if power < least_tone * noise:
+                status[i] = weak
+        if amplitude[i, 0].real ** 2 + amplitude[i, 0].imag ** 2 < least_carrier * variance[i, 0]:
+            status[i] = absent
+        if status[i] != 0:
+            phase[i] = math.nan
+            sigma[i] = math.nan
 
 
 @kernel
@@ -220,31 +515,58 @@ def cosine_sum_response(cycles, n, window, out):
         out[m] = total
 
 
-@kernel
-def group_response(cycles, template, shift, hop, n_group, out):
-    """Response of line a's sums over ``n_group`` blocks, turned back by its frequency, to each unit line b."""
-    for a in range(cycles.size):
-        for b in range(cycles.size):
-            inside = dirichlet(cycles[b] - shift - template[a], hop)
-            out[a, b] = inside * dirichlet((cycles[b] - cycles[a]) * hop, n_group)
+@kernel_inline
+def _sum_of_phasors(one, all_of_them, n):
+    """1 + z + … + z^(n−1) from z and zⁿ."""
+    below = one - 1.0
+    size = below.real * below.real + below.imag * below.imag
+    if size < 1e-16:
+        return complex(float(n), 0.0)
+    return (all_of_them - 1.0) * below.conjugate() / size
 
 
 @kernel
-def gram(cycles, template, shift, hop, n_block, n_tail, centre, out):
-    """Response of the turned-back block sums to unit lines: ``sums = out @ amplitude``.
+def leakage(cycles, template, shift, hop, n_block, n_tail, n_group, whole, group):
+    """What a unit line adds to the turned-back block sums of every other, over what it adds to its own.
 
-    A line of frequency ``cycles[m]`` with its phase counted from sample ``centre`` passes template ``shift +
-    template[m]`` inside each block of ``hop`` samples; blocks are added after turning back by ``cycles``. The last
-    block may hold only ``n_tail`` samples (0: none).
+    A line of frequency ``cycles[b]`` passes template ``shift + template[a]`` inside each block of ``hop`` samples;
+    blocks are added after turning back by ``cycles[a]``. ``whole`` (line a, line b): over ``n_block`` blocks and a
+    last one of only ``n_tail`` samples (0: none). ``group``: over the first ``n_group`` blocks. A sum of phasors needs
+    only its step and its end, and those are products of one number a line: no sines for every pair.
     """
     n_line = cycles.size
-    for a in range(n_line):
-        for b in range(n_line):
-            inside = cycles[b] - shift - template[a]
-            between = cycles[b] - cycles[a]
-            g = dirichlet(inside, hop) * dirichlet(between * hop, n_block)
+    # of each line, and of each template
+    step = np.empty((n_line, 2), np.complex128)
+    end = np.empty((n_line, 2), np.complex128)
+    tail = np.empty((n_line, 2), np.complex128)
+    hop_turn = np.empty(n_line, np.complex128)
+    whole_turn = np.empty(n_line, np.complex128)
+    group_turn = np.empty(n_line, np.complex128)
+    for m in range(n_line):
+        for side, f in enumerate((cycles[m] - shift, template[m])):
+            step[m, side] = _phasor(f)
+            end[m, side] = _phasor(f * hop)
+            tail[m, side] = _phasor(f * n_tail)
+        hop_turn[m] = _phasor(cycles[m] * hop)
+        whole_turn[m] = _phasor(cycles[m] * hop * n_block)
+        group_turn[m] = _phasor(cycles[m] * hop * n_group)
+    for b in range(n_line):
+        own = cycles[b] - shift - template[b]
+        block = dirichlet(own, hop)
+        over_whole = 1.0 / (block * n_block + dirichlet(own, n_tail))
+        over_group = 1.0 / (block * n_group)
+        for a in range(n_line):
+            if a == b:
+                whole[a, a] = 1.0
+                group[a, a] = 1.0
+                continue
+            inside_step = step[b, 0] * step[a, 1].conjugate()
+            inside = _sum_of_phasors(inside_step, end[b, 0] * end[a, 1].conjugate(), hop)
+            between = hop_turn[b] * hop_turn[a].conjugate()
+            before_tail = whole_turn[b] * whole_turn[a].conjugate()
+            added = inside * _sum_of_phasors(between, before_tail, n_block)
             if n_tail > 0:
-                angle = 2.0 * math.pi * between * hop * n_block
-                g += dirichlet(inside, n_tail) * complex(math.cos(angle), math.sin(angle))
-            angle = -2.0 * math.pi * cycles[b] * centre
-            out[a, b] = g * complex(math.cos(angle), math.sin(angle))
+                added += before_tail * _sum_of_phasors(inside_step, tail[b, 0] * tail[a, 1].conjugate(), n_tail)
+            whole[a, b] = added * over_whole
+            added = inside * _sum_of_phasors(between, group_turn[b] * group_turn[a].conjugate(), n_group)
+            group[a, b] = added * over_group

@@ -8,8 +8,9 @@ is small and known, and accounted for exactly (`LineStreams.response`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,16 +19,49 @@ from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels
 from rfpose.dsp.plan import LinePlan
 
-__all__ = ["LineBank", "LineStreams"]
+__all__ = ["Inspection", "LineBank", "LineStreams", "inspect"]
 
 ComplexArray = npt.NDArray[np.complex128]
+Samples = npt.NDArray[np.int16] | npt.NDArray[np.float32]
 
 # Nuttall's four-term window with continuous first derivative: side lobes −93 dB, falling 18 dB an octave
 # (Nuttall 1981, IEEE Trans. ASSP 29(1), table II).
 NUTTALL = (0.355768, -0.487396, 0.144232, -0.012604)
+# Hann's falls as fast from −31 dB: where lines are far apart it stops them as well, and half as many windows cover a
+# frame.
+HANN = (0.5, -0.5)
 BOXCAR = (1.0,)
-_WINDOW_OVERLAP = 4  # the four-term window adds up to a constant at a hop of a quarter
+_OVERLAP = {NUTTALL: 4, HANN: 2, BOXCAR: 1}
+"""Windows that cover each sample; at this overlap they add up to a constant."""
+_HANN_GAP_BINS = 40.0
+"""Lines this far apart leak less than −106 dB into each other under Hann's window."""
+_LONGEST_BLOCK = 1600
+_LONGEST_FOLDED_BLOCK = 16384
+_ZERO_SEGMENT = 256
 _MAX_TILE_VALUES = 2**22  # float32 values of folded blocks held at a time
+
+
+class Inspection(NamedTuple):
+    """Samples at full scale, fill samples, samples in stretches of zeros, and samples that are NaN or infinite."""
+
+    clipped: int
+    fill: int
+    zero: int
+    not_finite: int
+
+
+Fold = Callable[[Samples, int, npt.NDArray[np.float32]], Inspection]
+"""Folds (sample, 2) into (block, 2·period); what it inspects on the way."""
+
+
+def inspect(samples: Samples, full_scale: float) -> Inspection:
+    """Count what is wrong with samples (sample, 2); component magnitudes from ``full_scale`` on are clipped."""
+    flat = samples.reshape(-1)
+    if samples.dtype == np.int16:
+        clipped, fill, zero = _kernels.inspect_i16(flat, np.int16(min(full_scale, 32767.0)), _ZERO_SEGMENT)
+        return Inspection(clipped, fill, zero, 0)
+    clipped, bad, zero = _kernels.inspect_f32(flat, float(full_scale), _ZERO_SEGMENT)
+    return Inspection(clipped, 0, zero, bad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +82,8 @@ class LineStreams:
         A block's template for a line turns at ``shift + template`` [cycles/sample].
     window
         Cosine-sum coefficients of the weights.
+    inspection
+        What is wrong with the samples.
     """
 
     stream: ComplexArray
@@ -60,6 +96,7 @@ class LineStreams:
     shift_cycles: float
     template_cycles: FloatArray
     window: tuple[float, ...]
+    inspection: Inspection
 
     @property
     def n_block(self) -> int:
@@ -71,30 +108,24 @@ class LineStreams:
         """The frame's centre, to which phases refer [samples from its start]."""
         return 0.5 * (self.n_sample - 1)
 
-    def at_clock(self, plan: LinePlan, from_ppm: float, to_ppm: float) -> LineStreams:
+    def at_clock(self, plan: LinePlan, clock_ppm: float) -> LineStreams:
         """Return the streams turned back for another clock offset (templates stay as they were)."""
-        cycles = plan.line_cycles(to_ppm)
-        back = (plan.line_cycles(from_ppm) - cycles) * self.hop
+        cycles = plan.line_cycles(clock_ppm)
+        back = (self.cycles - cycles) * self.hop
         stream = np.empty_like(self.stream)
         _kernels.turn(self.stream, back, stream)
-        return LineStreams(
-            stream=stream,
-            tail=self.tail * np.exp(2j * np.pi * back * self.n_block),
-            hop=self.hop,
-            n_tap=self.n_tap,
-            n_tail=self.n_tail,
-            n_sample=self.n_sample,
-            cycles=cycles,
-            shift_cycles=self.shift_cycles,
-            template_cycles=self.template_cycles,
-            window=self.window,
-        )
+        tail = self.tail * np.exp(2j * np.pi * back * self.n_block)
+        return replace(self, stream=stream, tail=tail, cycles=cycles)
+
+    @property
+    def inside_cycles(self) -> FloatArray:
+        """(line,) how fast each line turns against its template inside a block [cycles/sample]."""
+        return self.cycles - self.shift_cycles - self.template_cycles
 
     def response(self) -> ComplexArray:
         """(line,) response of one block at its start to each line's unit amplitude with phase counted from there."""
-        inside = self.cycles - self.shift_cycles - self.template_cycles
-        out = np.empty(len(inside), np.complex128)
-        _kernels.cosine_sum_response(inside, self.n_tap, np.array(self.window), out)
+        out = np.empty(len(self.cycles), np.complex128)
+        _kernels.cosine_sum_response(self.inside_cycles, self.n_tap, np.array(self.window), out)
         return out
 
 
@@ -109,63 +140,76 @@ class LineBank:
         Frame length [samples].
     windowed
         False: blocks without overlap and flat weights (for a joint least-squares fit of all lines, which needs no
-        stop band). True: overlapping blocks under a Nuttall window (each line filtered by itself).
+        stop band). True: overlapping blocks under a window (each line filtered by itself).
+    clock_range_ppm
+        How far the receiver's clock may be from where it is assumed [ppm]; the better it is known, the longer are the
+        flat blocks and the less is left to do after them. None: as far as the plan searches.
+    full_scale
+        Component magnitude at which a sample counts as clipped [counts].
     """
 
-    def __init__(self, plan: LinePlan, n_sample: int, *, windowed: bool) -> None:
+    def __init__(
+        self,
+        plan: LinePlan,
+        n_sample: int,
+        *,
+        windowed: bool,
+        clock_range_ppm: float | None = None,
+        full_scale: float = np.inf,
+    ) -> None:
         self.plan = plan
         self.n_sample = n_sample
-        self.window = NUTTALL if windowed else BOXCAR
-        n_tap = _window_length(plan, n_sample) if windowed else _block_length(plan, n_sample)
-        self.period, self.n_fold = _folding(plan.grid, n_tap, _WINDOW_OVERLAP if windowed else 1)
+        self.full_scale = float(full_scale)
+        n_tap = _window_length(plan, n_sample) if windowed else _block_length(plan, n_sample, clock_range_ppm)
+        self.window = _window(plan, n_tap) if windowed else BOXCAR
+        overlap = _OVERLAP[self.window]
+        self.period, self.n_fold = _folding(plan.grid, n_tap, overlap)
         self.n_tap = self.period * self.n_fold
-        self.hop = self.n_tap // _WINDOW_OVERLAP if windowed else self.n_tap
+        self.hop = self.n_tap // overlap
         self.n_block = (n_sample - self.n_tap) // self.hop + 1
         self.n_tail = 0 if windowed else n_sample - self.n_block * self.hop
         self._template = plan.line_hz / plan.sample_rate_hz
         self._matrix = _line_matrix(self._template, self.period)
-        self._weights = lru_cache(maxsize=64)(self._make_weights)
-
-    def _make_weights(self, shift_cycles: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
         n = np.arange(self.n_tap)
-        flat = sum(a * np.cos(2.0 * np.pi * h * (n + 0.5) / self.n_tap) for h, a in enumerate(self.window))
-        weight = flat * np.exp(-2j * np.pi * shift_cycles * n)
-        return weight.real.astype(np.float32), weight.imag.astype(np.float32)
+        self._envelope = np.sum(
+            [a * np.cos(2.0 * np.pi * h * (n + 0.5) / n.size) for h, a in enumerate(self.window)], 0
+        )
 
-    def streams(self, samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], clock_ppm: float) -> LineStreams:
+    def streams(self, samples: Samples, clock_ppm: float) -> LineStreams:
         """Separate one frame.
 
         Parameters
         ----------
         samples : (sample, 2)
-            I and Q, int16 or float32, C-contiguous, finite.
+            I and Q, int16 or float32, C-contiguous.
         clock_ppm
             Assumed clock offset [ppm].
         """
         cycles = self.plan.line_cycles(clock_ppm)
         shift = self.plan.common_shift_cycles(clock_ppm)
-        weight_re, weight_im = self._weights(shift)
+        fold = self._flat_fold(shift) if self._is_flat(samples) else self._weighted_fold(shift)
         n_line = len(cycles)
         blocks = np.empty((self.n_block, 2 * n_line), np.float32)
-        tile = max(1, _MAX_TILE_VALUES // (2 * self.period))
-        folded = np.empty((min(tile, self.n_block), 2 * self.period), np.float32)
+        tile = min(self.n_block, max(1, _MAX_TILE_VALUES // (2 * self.period)))
+        folded = np.empty((tile, 2 * self.period), np.float32)
+        counts = np.zeros(4, np.int64) if self._is_flat(samples) else np.array(inspect(samples, self.full_scale))
         for first in range(0, self.n_block, tile):
             count = min(tile, self.n_block - first)
-            self._fold(samples[first * self.hop :], weight_re, weight_im, count, folded)
+            end = (first + count) * self.hop if first + count < self.n_block else self.n_sample
+            counts += fold(samples[first * self.hop : end], count, folded)
             np.matmul(folded[:count], self._matrix, out=blocks[first : first + count])
         stream = np.empty((n_line, self.n_block), np.complex128)
         _kernels.turn_back(blocks, cycles * self.hop, stream)
-        tail = np.zeros((n_line, 1), np.complex128)
+        tail = np.zeros(n_line, np.complex128)
         if self.n_tail:
             last = np.zeros((self.n_tap, 2), samples.dtype)
             last[: self.n_tail] = samples[self.n_sample - self.n_tail :]
-            self._fold(last, weight_re, weight_im, 1, folded)
-            turn = np.exp(-2j * np.pi * cycles * (self.hop * self.n_block))
-            block = (folded[:1] @ self._matrix)[0]
-            tail[:, 0] = (block[:n_line] + 1j * block[n_line:]) * turn
+            fold(last, 1, folded)
+            block = folded[0] @ self._matrix
+            tail = (block[:n_line] + 1j * block[n_line:]) * np.exp(-2j * np.pi * cycles * (self.hop * self.n_block))
         return LineStreams(
             stream=stream,
-            tail=tail[:, 0],
+            tail=tail,
             hop=self.hop,
             n_tap=self.n_tap,
             n_tail=self.n_tail,
@@ -174,33 +218,66 @@ class LineBank:
             shift_cycles=shift,
             template_cycles=self._template,
             window=self.window,
+            inspection=Inspection(*counts.tolist()),
         )
 
-    def _fold(
-        self,
-        samples: npt.NDArray[np.int16] | npt.NDArray[np.float32],
-        weight_re: npt.NDArray[np.float32],
-        weight_im: npt.NDArray[np.float32],
-        n_block: int,
-        out: npt.NDArray[np.float32],
-    ) -> None:
-        if samples.dtype == np.int16:
-            flat = samples.view(np.int32).ravel()
-            _kernels.fold_i16(flat, weight_re, weight_im, self.hop, self.n_fold, self.period, n_block, out)
-        else:
-            flat_c = samples.view(np.complex64).ravel()
-            _kernels.fold_c64(flat_c, weight_re, weight_im, self.hop, self.n_fold, self.period, n_block, out)
+    def _is_flat(self, samples: Samples) -> bool:
+        """Whether samples are folded and inspected in one pass."""
+        return self.window == BOXCAR and samples.dtype == np.int16
+
+    def _turns(self, shift_cycles: float) -> tuple[ComplexArray, ComplexArray]:
+        """Phasors that turn back by ``shift_cycles`` a sample: of each row of a period, and inside a row."""
+        row = np.exp(-2j * np.pi * shift_cycles * self.period * np.arange(self.n_fold))
+        return row, np.exp(-2j * np.pi * shift_cycles * np.arange(self.period))
+
+    def _flat_fold(self, shift_cycles: float) -> Fold:
+        row, ramp = self._turns(shift_cycles)
+        turns = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
+        limit = np.int16(min(self.full_scale, 32767.0))
+
+        def fold(samples: Samples, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
+            pair = samples.view(np.int32).ravel()
+            flat = samples.reshape(-1)
+            clipped, fill, zero = _kernels.fold_flat_i16(flat, pair, *turns, n_block, limit, _ZERO_SEGMENT, out)
+            return Inspection(clipped, fill, zero, 0)
+
+        return fold
+
+    def _weighted_fold(self, shift_cycles: float) -> Fold:
+        row, ramp = self._turns(shift_cycles)
+        weight = self._envelope * np.multiply.outer(row, ramp).ravel()
+        parts = weight.real.astype(np.float32), weight.imag.astype(np.float32)
+
+        def fold(samples: Samples, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
+            is_int = samples.dtype == np.int16
+            flat = samples.view(np.int32 if is_int else np.complex64).ravel()
+            kernel = _kernels.fold_i16 if is_int else _kernels.fold_c64
+            kernel(flat, *parts, self.hop, self.n_fold, self.period, n_block, out)
+            return Inspection(0, 0, 0, 0)
+
+        return fold
 
 
-def _block_length(plan: LinePlan, n_sample: int) -> int:
-    """Flat blocks: long enough to be cheap, short enough that the clock's search range does not turn a line away.
+def _window(plan: LinePlan, n_tap: int) -> tuple[float, ...]:
+    """Hann's window where lines are so far apart that it stops them, else Nuttall's."""
+    gap_bins = n_tap * plan.smallest_gap_hz / plan.sample_rate_hz
+    return HANN if gap_bins >= _HANN_GAP_BINS else NUTTALL
+
+
+def _block_length(plan: LinePlan, n_sample: int, clock_range_ppm: float | None) -> int:
+    """Flat blocks: long enough to be cheap, short enough that an unknown clock does not turn a line away.
 
     A line turning 0.04 cycles inside a block loses 0.3 % of its power to the template.
     """
-    half_band = 0.5 * plan.sample_rate_hz
-    slope = (half_band * plan.clock_search_ppm * 1e-6) / plan.sample_rate_hz
+    if clock_range_ppm is None:
+        # about the assumed clock the band's centre stands still, and its edges turn most
+        slope, shortest_count, longest = 0.5e-6 * plan.clock_search_ppm, 16, _LONGEST_BLOCK
+    else:
+        slope = float(np.max(np.abs(plan.cycles_per_ppm()))) * clock_range_ppm
+        # without a common grid a block is not folded, and a longer one costs as much a sample
+        shortest_count, longest = 64, _LONGEST_BLOCK if plan.grid is None else _LONGEST_FOLDED_BLOCK
     by_clock = 0.04 / slope if slope > 0 else np.inf
-    return int(max(16, min(1600, by_clock, n_sample // 16)))
+    return int(max(16, min(longest, by_clock, n_sample // shortest_count)))
 
 
 def _window_length(plan: LinePlan, n_sample: int) -> int:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels
 from rfpose.dsp.bank import LineStreams
 from rfpose.dsp.plan import LinePlan
@@ -46,7 +47,7 @@ def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], p
 
 def refine_clock(
     streams: LineStreams, plan: LinePlan, clock_ppm: float, range_ppm: float
-) -> tuple[float, float, FloatArray]:
+) -> tuple[float, float, float]:
     """Refine the clock offset to the maximum of the power that the carriers add up to over the frame.
 
     Maximum likelihood for carriers of unknown complex amplitude that do not overlap, in white noise. The sidebands
@@ -65,48 +66,28 @@ def refine_clock(
         Refined offset.
     curvature
         Minus half the second derivative of the log likelihood, before division by the noise [1/ppm²].
-    power : (3,)
-        Coherent power at the refined offset, incoherent power, number of blocks.
+    coherence
+        Power at the refined offset over what it would be if all blocks added up: one without noise.
     """
     every = 1 + 2 * plan.n_tone
     slope_hop = plan.cycles_per_ppm()[::every] * streams.hop
-    carrier, n_group = _grouped(streams.stream[::every], float(np.max(np.abs(slope_hop))) * range_ppm)
-    slope_hop = slope_hop * n_group
-    n_block = carrier.shape[1]
     steepest = float(np.max(np.abs(slope_hop)))
-    step = 0.25 / (n_block * steepest) if n_block > 1 else np.inf
+    n_group = _group_length(streams.n_block, steepest * range_ppm)
+    n_part = streams.n_block // n_group
+    steepest *= n_group
+    step = 0.25 / (n_part * steepest)
     reach = min(range_ppm, 0.45 / steepest)
-    n_side = int(np.ceil(reach / step)) if np.isfinite(step) else 0
-    offset = 0.0
-    if n_side:
-        candidate = step * np.arange(-n_side, n_side + 1)
-        score = np.empty(len(candidate))
-        _kernels.coherent_power(carrier, slope_hop, candidate, score)
-        offset = float(candidate[int(np.argmax(score))])
-    curvature = np.nan
-    if n_block > 1:
-        small = 0.1 * step
-        score = np.empty(3)
-        for _ in range(2):
-            _kernels.coherent_power(carrier, slope_hop, offset + small * np.arange(-1.0, 2.0), score)
-            bend = score[0] - 2.0 * score[1] + score[2]
-            if not bend < 0.0:
-                break
-            offset -= 0.5 * small * float(score[2] - score[0]) / float(bend)
-            curvature = -0.5 * float(bend) / small**2
-    coherent = np.empty(1)
-    _kernels.coherent_power(carrier, slope_hop, np.array([offset]), coherent)
-    incoherent = float(np.sum(np.abs(carrier) ** 2)) * n_block
-    return clock_ppm + offset, curvature, np.array([coherent[0], incoherent, float(n_block)])
+    n_side = math.ceil(reach / step) if n_part > 1 else 0
+    offset, curvature, coherent, incoherent = _kernels.most_coherent(
+        streams.stream, every, n_group, slope_hop * n_group, n_side, step
+    )
+    return clock_ppm + offset, curvature, coherent / incoherent if incoherent > 0.0 else 0.0
 
 
-def _grouped(stream: npt.NDArray[np.complex128], turns: float) -> tuple[npt.NDArray[np.complex128], int]:
-    """Add up blocks in groups in which the search turns a line by no more than a twentieth of a cycle.
+def _group_length(n_block: int, turns: float) -> int:
+    """Blocks that may be added up: the search then turns a line by no more than a twentieth of a cycle in them.
 
     ``turns`` is how far the search turns a line from block to block. At least sixteen groups are kept; what does not
     fill a group at the end is left out.
     """
-    n_line, n_block = stream.shape
-    n_group = max(1, min(int(0.05 / turns) if turns > 0 else n_block, n_block // 16))
-    n_part = n_block // n_group
-    return np.ascontiguousarray(stream[:, : n_part * n_group].reshape(n_line, n_part, n_group).sum(axis=2)), n_group
+    return max(1, min(int(0.05 / turns) if turns > 0 else n_block, n_block // 16))

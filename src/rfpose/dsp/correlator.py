@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,26 +21,48 @@ _MAX_GROUPS = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Mixing:
+    """How lines leak into each other's block sums, each line's own response taken as one.
+
+    It hardly changes with the clock: a step of a thousandth of a ppm moves it by less than 1e-7. A second fit after
+    such a step uses it again.
+
+    Attributes
+    ----------
+    inverse : (line, line)
+        Takes the leakage off the sums over a whole frame.
+    group : (line, line)
+        Leakage in the sums over a group of blocks.
+    """
+
+    inverse: ComplexArray
+    group: ComplexArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LineFit:
     """Amplitudes of all lines in one frame.
 
     Attributes
     ----------
     amplitude : (line,)
-        Complex amplitude at the frame's centre.
+        Complex amplitude at the frame's centre; a small step of the clock does not move it.
     variance : (line,)
-        Variance of the complex amplitude, from the noise left in the blocks about each line.
+        Variance of the complex amplitude, from the noise left in the blocks about each line after the clock's step.
     clock_step_ppm, clock_step_sigma_ppm
         How far the residuals ask the clock offset to move, one Gauss-Newton step, and its standard deviation [ppm].
+    mixing
+        For another fit of the same frame.
     """
 
     amplitude: ComplexArray
     variance: FloatArray
     clock_step_ppm: float
     clock_step_sigma_ppm: float
+    mixing: Mixing
 
 
-def fit_lines(streams: LineStreams, cycles_per_ppm: FloatArray) -> LineFit:
+def fit_lines(streams: LineStreams, cycles_per_ppm: FloatArray, mixing: Mixing | None = None) -> LineFit:
     """Fit the amplitudes of all lines to the block sums, by least squares over the whole frame.
 
     With x = A c + noise and block templates T close to A, solves (Tᴴ A) c = Tᴴ x: unbiased whatever the lines'
@@ -51,70 +74,70 @@ def fit_lines(streams: LineStreams, cycles_per_ppm: FloatArray) -> LineFit:
         Of a bank without window.
     cycles_per_ppm : (line,)
         How far the clock moves each line [cycles/sample/ppm].
+    mixing
+        That of a fit of the same frame at a clock offset close by.
     """
     n_line = len(streams.cycles)
-    gram = np.empty((n_line, n_line), np.complex128)
-    _kernels.gram(
+    n_group = max(1, streams.n_block // _MAX_GROUPS)
+    n_part = streams.n_block // n_group
+    if mixing is None:
+        mixing = _mixing(streams, n_group)
+    amplitude, own = np.empty((2, n_line), np.complex128)
+    model = np.empty((n_line, n_part), np.complex128)
+    _kernels.model_of_lines(
+        streams.stream.sum(axis=1) + streams.tail,
+        mixing.inverse,
+        streams.cycles,
+        streams.inside_cycles,
+        streams.hop,
+        streams.n_block,
+        streams.n_tail,
+        n_group,
+        streams.centre,
+        amplitude,
+        own,
+        model,
+    )
+    # Groups keep the work small in long frames; they are all alike, so that a few blocks at the end may be left out.
+    grouped = streams.stream[:, : n_part * n_group]
+    if n_group > 1:
+        grouped = grouped.reshape(n_line, n_part, n_group).sum(axis=2)
+    span = streams.hop * n_group
+    scatter = np.empty(n_line)
+    step, power = _kernels.residual_moments(
+        grouped,
+        mixing.group @ model,
+        streams.cycles * span,
+        2.0 * np.pi * cycles_per_ppm * model[:, 0],
+        0.5 * span - 0.5 - streams.centre,
+        span,
+        scatter,
+    )
+    n_free = max(1, n_part - 1)
+    noise = smooth_variance(scatter / (span * n_free), 2.0 * n_free)
+    return LineFit(
+        amplitude=amplitude,
+        variance=noise * np.abs(mixing.inverse.diagonal() / own),
+        clock_step_ppm=step,
+        clock_step_sigma_ppm=math.sqrt(0.5 * span * float(noise.mean()) / power) if power > 0.0 else np.inf,
+        mixing=mixing,
+    )
+
+
+def _mixing(streams: LineStreams, n_group: int) -> Mixing:
+    whole, group = np.empty((2, len(streams.cycles), len(streams.cycles)), np.complex128)
+    _kernels.leakage(
         streams.cycles,
         streams.template_cycles,
         streams.shift_cycles,
         streams.hop,
         streams.n_block,
         streams.n_tail,
-        streams.centre,
-        gram,
+        n_group,
+        whole,
+        group,
     )
-    inverse = np.linalg.inv(gram)
-    amplitude = inverse @ (streams.stream.sum(axis=1) + streams.tail)
-    left, n_group = _residual(streams, amplitude)
-    n_free = max(1, left.shape[1] - 1)
-    noise = smooth_variance(np.sum(np.abs(left) ** 2, axis=1) / (streams.hop * n_group * n_free), 2.0 * n_free)
-    step, power = _clock_step(streams, amplitude, left, n_group, cycles_per_ppm)
-    group_noise = float(np.mean(noise)) * streams.hop * n_group
-    return LineFit(
-        amplitude=amplitude,
-        variance=noise * np.abs(np.diag(inverse)),
-        clock_step_ppm=step,
-        clock_step_sigma_ppm=float(np.sqrt(0.5 * group_noise / power)) if power > 0.0 else np.inf,
-    )
-
-
-def _residual(streams: LineStreams, amplitude: ComplexArray) -> tuple[ComplexArray, int]:
-    """Return what the fit leaves at each line, (line, group), and how many blocks were added up in a group.
-
-    Leakage between lines is taken into account. Groups keep the work small in long frames; they are all alike, so
-    that a few blocks at the end may be left out.
-    """
-    n_group = max(1, streams.n_block // _MAX_GROUPS)
-    n_part = streams.n_block // n_group
-    span = streams.hop * n_group
-    grouped = streams.stream[:, : n_part * n_group].reshape(len(amplitude), n_part, n_group).sum(axis=2)
-    response = np.empty((len(amplitude), len(amplitude)), np.complex128)
-    _kernels.group_response(
-        streams.cycles, streams.template_cycles, streams.shift_cycles, streams.hop, n_group, response
-    )
-    # Streams are turned back by each line's own frequency. Turn the model of every line from there into absolute
-    # time, pass it through the response, and turn it back by line l's frequency.
-    start_turn = np.exp(-2j * np.pi * streams.cycles * streams.centre)
-    constant = np.repeat((amplitude * start_turn)[:, None], n_part, axis=1)
-    absolute = np.empty_like(constant)
-    _kernels.turn(constant, streams.cycles * span, absolute)
-    model = np.empty_like(constant)
-    _kernels.turn(response @ absolute, -streams.cycles * span, model)
-    return np.asarray(grouped - model), n_group
-
-
-def _clock_step(
-    streams: LineStreams, amplitude: ComplexArray, left: ComplexArray, n_group: int, cycles_per_ppm: FloatArray
-) -> tuple[float, float]:
-    """Return the change of the clock offset that the residuals ask for [ppm], and the power that speaks for it."""
-    span = streams.hop * n_group
-    middle = span * (np.arange(left.shape[1]) + 0.5) - 0.5 - streams.centre
-    turn = np.exp(-2j * np.pi * streams.cycles * streams.centre)
-    slope = 2j * np.pi * cycles_per_ppm * amplitude * turn * streams.response() * n_group
-    power = float(np.sum(np.abs(slope) ** 2)) * float(np.sum(middle**2))
-    step = float(np.sum((slope.conj() * (left @ middle)).real) / power) if power > 0.0 else 0.0
-    return step, power
+    return Mixing(inverse=np.asarray(np.linalg.inv(whole), np.complex128), group=group)
 
 
 def smooth_variance(variance: FloatArray, dof: float) -> FloatArray:
@@ -130,13 +153,6 @@ def smooth_variance(variance: FloatArray, dof: float) -> FloatArray:
     dof
         Degrees of freedom of each.
     """
-    pooled = float(np.mean(variance))
-    if not pooled > 0.0 or len(variance) < 3:
-        return variance
-    log_ratio = np.log(np.maximum(variance, 1e-300))
-    excess = float(np.var(log_ratio, ddof=1)) - 2.0 / dof
-    if excess <= 0.0:
-        return np.full_like(variance, pooled)
-    prior_dof = 2.0 / excess
-    typical = float(np.exp(np.median(log_ratio)))
-    return np.asarray((prior_dof * typical + dof * variance) / (prior_dof + dof))
+    out = np.empty(len(variance))
+    _kernels.smooth_variance(variance, dof, out)
+    return out

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels, hilbert
-from rfpose.dsp.bank import LineBank, LineStreams
+from rfpose.dsp.bank import Inspection, LineBank, LineStreams, inspect
 from rfpose.dsp.clock import coarse_clock_ppm, refine_clock
 from rfpose.dsp.correlator import fit_lines
 from rfpose.dsp.plan import LinePlan
@@ -24,9 +24,10 @@ Samples = npt.NDArray[np.int16] | npt.NDArray[np.float32]
 ESTIMATORS = ("hilbert", "correlator", "dot", "dot-compensated")
 
 _MAX_CLIPPED_FRACTION = 1e-4
-_ZERO_SEGMENT = 256
 _CLOCK_DRIFT_PPM = 0.5
 """How far a clock may wander from where it was acquired before it is acquired anew."""
+_LINEAR_STEP_SIGMA = 3.0
+"""A step of the clock within so many sigma bends the lines less than the noise does: it needs no second fit."""
 _CARRIER_POWER_SNR = 25.0
 """A carrier counts as present above this power ratio to the noise: false alarm exp(−25) a line."""
 _TONE_POWER_SNR = 8.0
@@ -60,8 +61,19 @@ class ToneExtractor:
         self.estimator = estimator
         self.full_scale = float(full_scale)
         self._bank = lru_cache(maxsize=4)(self._make_bank)
+        self._search_bank = lru_cache(maxsize=4)(self._make_search_bank)
+        self._drift_ppm = min(_CLOCK_DRIFT_PPM, plan.clock_search_ppm)
 
     def _make_bank(self, n_sample: int) -> LineBank:
+        return LineBank(
+            self.plan,
+            n_sample,
+            windowed=self.estimator != "correlator",
+            clock_range_ppm=self._drift_ppm,
+            full_scale=self.full_scale,
+        )
+
+    def _make_search_bank(self, n_sample: int) -> LineBank:
         return LineBank(self.plan, n_sample, windowed=self.estimator != "correlator")
 
     def acquire_clock(self, samples: npt.ArrayLike) -> float:
@@ -73,11 +85,11 @@ class ToneExtractor:
             One frame.
         """
         x = _as_samples(samples)
-        if self._fault(x)[0] is not LineStatus.OK:
+        if _fault(inspect(x, self.full_scale), len(x)) is not LineStatus.OK:
             return np.nan
         coarse = coarse_clock_ppm(x, self.plan)
         bin_ppm = 1.0 / (min(len(x), 2**17) * float(np.max(np.abs(self.plan.cycles_per_ppm()))))
-        streams = self._bank(len(x)).streams(x, coarse)
+        streams = self._search_bank(len(x)).streams(x, coarse)
         return refine_clock(streams, self.plan, coarse, min(bin_ppm, self.plan.clock_search_ppm))[0]
 
     def measure(self, samples: npt.ArrayLike, *, clock_ppm: float | None = None) -> FrameTones:
@@ -102,30 +114,30 @@ class ToneExtractor:
             Samples of another shape or type, or fewer than 64.
         """
         x = _as_samples(samples)
-        fault, clipped = self._fault(x)
-        if fault is not LineStatus.OK:
-            return FrameTones.failed(self.plan.n_transmitter, self.plan.n_tone, fault, clipped_fraction=clipped)
         bank = self._bank(len(x))
         start_ppm = self.acquire_clock(x) if clock_ppm is None or not np.isfinite(clock_ppm) else float(clock_ppm)
-        streams = bank.streams(x, start_ppm)
-        drift = min(_CLOCK_DRIFT_PPM, self.plan.clock_search_ppm)
-        ppm, curvature, power = refine_clock(streams, self.plan, start_ppm, drift)
-        if clock_ppm is not None and power[0] < 0.5 * power[1]:
+        # a frame whose samples are bad has no clock; its samples are looked at all the same
+        streams = bank.streams(x, start_ppm if np.isfinite(start_ppm) else 0.0)
+        fault, clipped = _fault(streams.inspection, len(x)), streams.inspection.clipped / len(x)
+        if fault is not LineStatus.OK:
+            return FrameTones.failed(self.plan.n_transmitter, self.plan.n_tone, fault, clipped_fraction=clipped)
+        ppm, curvature, coherence = refine_clock(streams, self.plan, start_ppm, self._drift_ppm)
+        if clock_ppm is not None and coherence < 0.5:
             # the lines do not add up: either all is noise, or the clock has jumped
             again = self.acquire_clock(x)
-            if abs(again - ppm) > drift:
-                start_ppm = again
-                streams = bank.streams(x, start_ppm)
-                ppm, curvature, power = refine_clock(streams, self.plan, start_ppm, drift)
-        streams = streams.at_clock(self.plan, start_ppm, ppm)
+            if abs(again - ppm) > self._drift_ppm:
+                streams = bank.streams(x, again)
+                ppm, curvature, _ = refine_clock(streams, self.plan, again, self._drift_ppm)
+        streams = streams.at_clock(self.plan, ppm)
         if self.estimator != "correlator":
             return self._from_filters(streams, ppm, curvature, clipped)
         slope = self.plan.cycles_per_ppm()
         fit = fit_lines(streams, slope)
-        if abs(fit.clock_step_ppm) > 0.3 * fit.clock_step_sigma_ppm:
-            # the power's maximum is shifted a little by leakage between lines; their joint fit is not
+        # the power's maximum is shifted a little by leakage between lines; their joint fit is not
+        ppm += fit.clock_step_ppm
+        if abs(fit.clock_step_ppm) > _LINEAR_STEP_SIGMA * fit.clock_step_sigma_ppm:
+            fit = fit_lines(streams.at_clock(self.plan, ppm), slope, fit.mixing)
             ppm += fit.clock_step_ppm
-            fit = fit_lines(streams.at_clock(self.plan, ppm - fit.clock_step_ppm, ppm), slope)
         tone = hilbert.analytic_tones(fit.amplitude[:, None], self.plan.n_transmitter, self.plan.n_tone)[..., 0]
         return self._tones(
             fit.amplitude,
@@ -141,8 +153,7 @@ class ToneExtractor:
     def _from_filters(self, streams: LineStreams, ppm: float, curvature: float, clipped: float) -> FrameTones:
         """Measure by averaging the filtered, analytic tones."""
         n_transmitter, n_tone = self.plan.n_transmitter, self.plan.n_tone
-        line = hilbert.centred_streams(streams)
-        amplitude, variance = hilbert.average_lines(streams, line)
+        line, amplitude, variance = hilbert.average_lines(streams)
         tone = hilbert.analytic_tones(amplitude[:, None], n_transmitter, n_tone)[..., 0]
         phase, added = self._averaged_phase(
             streams, hilbert.analytic_tones(line, n_transmitter, n_tone), tone, variance
@@ -150,27 +161,6 @@ class ToneExtractor:
         n_effective = hilbert.window_statistics(streams).equivalent_samples
         clock = ppm, _clock_sigma(streams, curvature, float(np.median(variance)) * n_effective)
         return self._tones(amplitude, variance, tone, phase, added, n_effective, clock, clipped)
-
-    def _fault(self, x: Samples) -> tuple[LineStatus, float]:
-        """Return what is wrong with the samples, and the fraction at full scale."""
-        flat = x.reshape(-1)
-        if x.dtype == np.int16:
-            limit = min(self.full_scale, 32767.0)
-            n_clip, n_fill, n_zero = _kernels.inspect_i16(flat, np.int16(limit), _ZERO_SEGMENT)
-            n_bad = 0
-        else:
-            n_clip, n_bad, n_zero = _kernels.inspect_f32(flat, self.full_scale, _ZERO_SEGMENT)
-            n_fill = 0
-        clipped = n_clip / len(x)
-        if n_bad:
-            return LineStatus.NOT_FINITE, clipped
-        if n_zero == len(x):
-            return LineStatus.NO_SIGNAL, clipped
-        if n_zero or n_fill:
-            return LineStatus.MISSING_SAMPLES, clipped
-        if clipped > _MAX_CLIPPED_FRACTION:
-            return LineStatus.CLIPPED, clipped
-        return LineStatus.OK, clipped
 
     def _tones(
         self,
@@ -186,22 +176,28 @@ class ToneExtractor:
         """Put the record together, and mark what is too weak."""
         n_transmitter = self.plan.n_transmitter
         by_transmitter, lines = amplitude.reshape(n_transmitter, -1), variance.reshape(n_transmitter, -1)
-        tone_variance = lines[:, 1::2] + lines[:, 2::2]
-        tone_power = np.abs(tone) ** 2
-        sigma = np.sqrt(0.5 * tone_variance / tone_power + added_variance)
-        status = np.full(n_transmitter, LineStatus.OK, np.uint8)
-        status[np.any(tone_power < _TONE_POWER_SNR * tone_variance, axis=1)] = LineStatus.WEAK
-        status[np.abs(by_transmitter[:, 0]) ** 2 < _CARRIER_POWER_SNR * lines[:, 0]] = LineStatus.ABSENT
-        bad = status != LineStatus.OK
-        phase[bad] = np.nan
-        sigma[bad] = np.nan
+        sigma, status = np.empty(tone.shape), np.full(n_transmitter, LineStatus.OK, np.uint8)
+        _kernels.tone_quality(
+            by_transmitter,
+            lines,
+            tone,
+            np.broadcast_to(added_variance, tone.shape),
+            _CARRIER_POWER_SNR,
+            _TONE_POWER_SNR,
+            int(LineStatus.ABSENT),
+            int(LineStatus.WEAK),
+            phase,
+            sigma,
+            status,
+        )
+        line_sigma = np.sqrt(0.5 * lines)
         return FrameTones(
             phase_rad=phase,
             sigma_rad=sigma,
             carrier=by_transmitter[:, 0],
-            carrier_sigma=np.sqrt(0.5 * lines[:, 0]),
-            sideband=np.stack([by_transmitter[:, k::2] for k in (1, 2)], axis=-1),
-            sideband_sigma=np.sqrt(0.5 * np.stack([lines[:, k::2] for k in (1, 2)], axis=-1)),
+            carrier_sigma=line_sigma[:, 0],
+            sideband=by_transmitter[:, 1:].reshape(*tone.shape, 2),
+            sideband_sigma=line_sigma[:, 1:].reshape(*tone.shape, 2),
             clock_ppm=clock[0],
             clock_sigma_ppm=clock[1],
             noise_variance=float(np.median(variance)) * n_effective,
@@ -228,6 +224,19 @@ class ToneExtractor:
         difference = np.mod(signed - signed[reference] + np.pi, 2.0 * np.pi) - np.pi
         phase = np.where(np.arange(len(unsigned))[:, None] == reference, 0.0, np.copysign(unsigned, difference))
         return phase, np.zeros_like(phase)
+
+
+def _fault(inspection: Inspection, n_sample: int) -> LineStatus:
+    """Return what is wrong with a frame's samples."""
+    if inspection.not_finite:
+        return LineStatus.NOT_FINITE
+    if inspection.zero == n_sample:
+        return LineStatus.NO_SIGNAL
+    if inspection.zero or inspection.fill:
+        return LineStatus.MISSING_SAMPLES
+    if inspection.clipped > _MAX_CLIPPED_FRACTION * n_sample:
+        return LineStatus.CLIPPED
+    return LineStatus.OK
 
 
 def _clock_sigma(streams: LineStreams, curvature: float, noise_variance: float) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.dsp import _kernels
 from rfpose.dsp.bank import LineStreams
 from rfpose.dsp.correlator import smooth_variance
 
@@ -34,8 +35,12 @@ ComplexArray = npt.NDArray[np.complex128]
 
 def centred_streams(streams: LineStreams) -> ComplexArray:
     """(line, block) amplitude of each line over time, its phase referred to the frame's centre."""
-    turn = np.exp(2j * np.pi * streams.cycles * streams.centre) / streams.response()
-    return np.asarray(streams.stream * turn[:, None])
+    return np.asarray(streams.stream * _to_centre(streams)[:, None])
+
+
+def _to_centre(streams: LineStreams) -> ComplexArray:
+    """(line,) factor that makes a filter's output the line's amplitude with its phase at the frame's centre."""
+    return np.asarray(np.exp(2j * np.pi * streams.cycles * streams.centre) / streams.response())
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,30 +90,33 @@ def _window_statistics(window: tuple[float, ...], n_tap: int, hop: int, n_block:
 
 def analytic_tones(line: ComplexArray, n_transmitter: int, n_tone: int) -> ComplexArray:
     """(transmitter, tone, block) analytic tones from (line, block) amplitudes."""
-    lines = line.reshape(n_transmitter, 1 + 2 * n_tone, -1)
-    carrier = lines[:, 0]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        back = (carrier.conj() / np.abs(carrier))[:, None]
-    return np.asarray(lines[:, 1::2] * back + (lines[:, 2::2] * back).conj())
+    out = np.empty((n_transmitter, n_tone, line.shape[1]), np.complex128)
+    _kernels.analytic_tones(line, n_tone, out)
+    return out
 
 
-def average_lines(streams: LineStreams, line: ComplexArray) -> tuple[ComplexArray, FloatArray]:
-    """Mean amplitude of each line and the variance of that mean, from the scatter about it.
+def average_lines(streams: LineStreams) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Each line over time, its mean amplitude, and the variance of that mean from the scatter about it.
 
     Parameters
     ----------
     streams
         Of a windowed bank.
+
+    Returns
+    -------
     line : (line, block)
-        `centred_streams`.
+        As `centred_streams`.
+    amplitude, variance : (line,)
     """
     statistics = window_statistics(streams)
-    amplitude = line.mean(axis=1)
-    scatter = np.mean(np.abs(line - amplitude[:, None]) ** 2, axis=1)
+    line = np.array(streams.stream)
+    amplitude, scatter = np.empty(len(line), np.complex128), np.empty(len(line))
+    _kernels.filtered_lines(line, _to_centre(streams), amplitude, scatter)
     n_equivalent = statistics.equivalent_samples
-    per_sample = scatter / (statistics.gain - 1.0 / n_equivalent)
     dof = max(2.0 * n_equivalent * statistics.gain, 2.0)
-    return amplitude, smooth_variance(per_sample, dof) / n_equivalent
+    per_sample = scatter / (statistics.gain - 1.0 / n_equivalent)
+    return line, amplitude, smooth_variance(per_sample, dof) / n_equivalent
 
 
 def unit_phasor_variance(relative_noise: FloatArray, streams: LineStreams) -> FloatArray:
@@ -128,8 +136,9 @@ def unit_phasor_variance(relative_noise: FloatArray, streams: LineStreams) -> Fl
 
 def unit_phasor_phase(tone: ComplexArray) -> FloatArray:
     """Phase of the mean unit phasor over the last axis (§3.1.3) [rad]."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.angle(np.mean(tone / np.abs(tone), axis=-1)))
+    mean = np.empty(tone.shape[:2], np.complex128)
+    _kernels.mean_unit_phasor(tone, mean)
+    return np.asarray(np.angle(mean))
 
 
 def dot_phase(tone: ComplexArray, reference: ComplexArray) -> FloatArray:
