@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,17 @@ from rfpose.errors import InvalidInputError
 if TYPE_CHECKING:
     from rfpose.scenario import Scenario
 
-__all__ = ["Calibration", "CalibrationStatus", "calibrate", "electronic_phase", "wrap"]
+__all__ = [
+    "Calibration",
+    "CalibrationStatus",
+    "PhaseAverage",
+    "average_phases",
+    "calibrate",
+    "electronic_phase",
+    "frame_times",
+    "phase_average",
+    "wrap",
+]
 
 
 class CalibrationStatus(IntEnum):
@@ -74,9 +84,9 @@ def electronic_phase(
     wavelength_m: npt.ArrayLike,
     survey_sigma_m: npt.ArrayLike = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Electronic phase Φ_i = φ_i + 2π d_i / λ from the tone phases of calibration receivers (§3.6).
+    """Electronic phases Φ_i = φ_i + 2π d_i / λ from the tone phases of calibration receivers (§3.6).
 
-    Several receivers are put on the first one's clock and averaged with their weights.
+    Several receivers are put on one clock and averaged with their weights.
 
     Parameters
     ----------
@@ -101,6 +111,27 @@ def electronic_phase(
     InvalidInputError
         Shapes that do not fit together.
     """
+    average = average_phases(
+        phase_rad,
+        sigma_rad,
+        calibration_enu_m=calibration_enu_m,
+        transmitter_enu_m=transmitter_enu_m,
+        wavelength_m=wavelength_m,
+        survey_sigma_m=survey_sigma_m,
+    )
+    return average.phase_rad, average.sigma_rad
+
+
+def average_phases(
+    phase_rad: npt.ArrayLike,
+    sigma_rad: npt.ArrayLike,
+    *,
+    calibration_enu_m: npt.ArrayLike,
+    transmitter_enu_m: npt.ArrayLike,
+    wavelength_m: npt.ArrayLike,
+    survey_sigma_m: npt.ArrayLike = 0.0,
+) -> PhaseAverage:
+    """Return what `electronic_phase` averages, and how; arguments and errors are its own."""
     phase = as_float_array("phase_rad", phase_rad, ("frame", "calibration", "transmitter", "tone"), finite=False)
     n_cal, n_transmitter, n_tone = phase.shape[1:]
     sigma = as_float_array("sigma_rad", sigma_rad, phase.shape, finite=False, positive=False)
@@ -115,23 +146,138 @@ def electronic_phase(
     phi = phase + range_m[None, :, :, None] * wavenumber
     variance = sigma**2 + (survey[:, None, None] * wavenumber) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(np.isfinite(phi), 1.0 / variance, 0.0)
-    phasor = np.where(np.isfinite(phi), np.exp(1j * np.nan_to_num(phi)), 0.0)
-    # one common phase a frame, tone and receiver is that receiver's clock: bring all onto the first that saw anything
-    total = np.zeros(phasor[:, 0].shape, np.complex128)
-    total_weight = np.zeros(total.shape)
-    for i in range(n_cal):
-        seen_before = np.sum(np.abs(total), axis=1, keepdims=True) > 0
-        turn = np.sum(weight[:, i] * phasor[:, i].conj() * total, axis=1, keepdims=True)
-        size = np.abs(turn)
-        turn = np.where(seen_before & (size > 0), turn / np.where(size > 0, size, 1.0), 1.0)
-        joins = ~seen_before | (size > 0)
-        total = total + np.where(joins, weight[:, i] * phasor[:, i] * turn, 0.0)
-        total_weight = total_weight + np.where(joins, weight[:, i], 0.0)
-    seen = total_weight > 0
-    with np.errstate(divide="ignore"):
-        sigma_out = np.where(seen, 1.0 / np.sqrt(total_weight), np.nan)
-    return np.where(seen, wrap(np.angle(total)), np.nan), sigma_out
+        weight = np.where(np.isfinite(phi) & np.isfinite(variance), 1.0 / variance, 0.0)
+    return PhaseAverage(
+        phi_rad=np.where(weight > 0.0, phi, 0.0), weight=np.where(_joined(weight), weight, 0.0), time_s=None
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhaseAverage:
+    """What each calibration receiver alone takes the electronic phases to be, and how they become one.
+
+    Φ and one clock a receiver are found by least squares, frame by frame and tone by tone; a frame's Φ are known up to
+    one constant a tone. Averages are of phases, not of phasors: they change in proportion to what they are made of.
+
+    Attributes
+    ----------
+    phi_rad : (frame, calibration receiver, transmitter, tone)
+        Phase and range [rad], on the receiver's own clock.
+    weight : (frame, calibration receiver, transmitter, tone)
+        1/σ²; 0 = not seen, or by a receiver that shares no transmitter with the rest.
+    time_s : (frame,)
+        For frames in which a transmitter was not measured [s]; None: frames follow each other evenly.
+    """
+
+    phi_rad: FloatArray
+    weight: FloatArray
+    time_s: FloatArray | None
+
+    @property
+    def sigma_rad(self) -> FloatArray:
+        """(frame, transmitter, tone) standard deviation of the phases; NaN where not measured."""
+        total = self.weight.sum(axis=1)
+        with np.errstate(divide="ignore"):
+            return np.where(total > 0.0, 1.0 / np.sqrt(total), np.nan)
+
+    @property
+    def phase_rad(self) -> FloatArray:
+        """(frame, transmitter, tone) electronic phases; NaN where not measured."""
+        return np.where(self.weight.sum(axis=1) > 0.0, wrap(_mean_phase(self.phi_rad, self.weight)), np.nan)
+
+    def change_rad(self, shift_rad: FloatArray, frames: npt.NDArray[np.int64]) -> FloatArray:
+        """Change of the electronic phases where each receiver's are changed first.
+
+        Parameters
+        ----------
+        shift_rad : (calibration receiver, transmitter, tone, 1 + parameter)
+            What is added to each receiver's phases, of whatever size, and its derivatives by parameters [rad].
+        frames : (row,)
+            Frames that are asked for.
+
+        Returns
+        -------
+        (row, transmitter, tone, 1 + parameter)
+            [rad], up to one constant a row and tone; 0 where nothing was ever measured.
+        """
+        measured = np.all(self.weight.sum(axis=1) > 0.0, axis=2)
+        time_s = np.arange(float(len(measured))) if self.time_s is None else self.time_s
+        before, after, share = _sources(measured, time_s)
+        needed = np.unique(np.concatenate([frames, before[frames].ravel(), after[frames].ravel()]))
+        phi, weight = self.phi_rad[needed], self.weight[needed]
+        seen = weight.sum(axis=1) > 0.0
+        change = np.array(_least_squares(np.broadcast_to(shift_rad, (*phi.shape, shift_rad.shape[-1])), weight)[0])
+        step = _mean_phase(phi + shift_rad[..., 0], weight) - _mean_phase(phi, weight)
+        # on one branch: relative to what all transmitters have in common
+        common = np.angle(np.sum(np.where(seen, np.exp(1j * step), 0.0), axis=1, keepdims=True))
+        change[..., 0] = np.where(seen, common + wrap(step - common), 0.0)
+        row = np.searchsorted(needed, frames)
+        out = change[row]
+        for k, i in np.argwhere(~measured[frames]):
+            f = frames[k]
+            both = [np.searchsorted(needed, g[f, i]) for g in (before, after)]
+            parts = [change[g, i] + _datum(change[row[k]] - change[g], measured[[f, needed[g]]]) for g in both]
+            out[k, i] = (1.0 - share[f, i]) * parts[0] + share[f, i] * parts[1]
+        return out
+
+
+def _datum(difference: FloatArray, measured: npt.NDArray[np.bool_]) -> FloatArray:
+    """(tone, …) mean of a difference between two frames (transmitter, …) over transmitters measured in both."""
+    both = measured.all(axis=0)
+    return np.asarray(difference[both].mean(axis=0) if both.any() else np.zeros(difference.shape[1:]))
+
+
+def _joined(weight: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which receivers' clocks can be compared, (frame, receiver, 1, tone): of groups that share no transmitter, one."""
+    sees = np.moveaxis(weight > 0.0, 3, 1)
+    reach = (sees.astype(np.float64) @ np.swapaxes(sees, 2, 3).astype(np.float64)) > 0.0
+    for _ in range(max(1, int(np.ceil(np.log2(max(2, weight.shape[1])))))):
+        reach = (reach.astype(np.float64) @ reach.astype(np.float64)) > 0.0
+    own = np.moveaxis(weight.sum(axis=2), 2, 1)
+    group = np.argmax((reach * own[:, :, None]).sum(axis=3), axis=2)
+    chosen = np.take_along_axis(reach, group[..., None, None], axis=2)[:, :, 0]
+    return np.moveaxis(chosen, 1, 2)[:, :, None]
+
+
+def _mean_phase(phi: FloatArray, weight: FloatArray) -> FloatArray:
+    """(frame, transmitter, tone) least-squares phases, one clock a receiver taken off, not wrapped."""
+    phasor = np.where(weight > 0.0, np.exp(1j * phi), 0.0)
+    # clocks to begin with: how receivers' phases turn against each other over all transmitters at once
+    root = np.moveaxis(np.sqrt(weight) * phasor, 3, 1)
+    clock = np.angle(np.linalg.eigh(root @ np.swapaxes(root.conj(), 2, 3))[1][..., -1])
+    clock = np.moveaxis(clock, 1, 2)[:, :, None]
+    mean = np.angle(np.sum(weight * phasor * np.exp(-1j * clock), axis=1))
+    for _ in range(2):
+        # a mean of phasors is not the phasor of a mean: what is left of each is averaged as it is
+        left = wrap(phi - clock - mean[:, None])
+        step, clock_step = _least_squares(left[..., None], weight)
+        mean = mean + step[..., 0]
+        clock = clock + clock_step[..., 0][:, :, None]
+    # the constant that leaves the receivers' clocks zero on average
+    of_receiver = weight.sum(axis=2)[:, :, None]
+    total = np.maximum(of_receiver.sum(axis=1, keepdims=True), 1e-300)
+    return np.asarray(mean + (of_receiver * wrap(clock) / total).sum(axis=1))
+
+
+def _least_squares(value: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means (frame, transmitter, tone, k) and clocks (frame, receiver, tone, k) of values (…, receiver, …, tone, k).
+
+    Clocks average to zero.
+    """
+    w = np.moveaxis(weight, 3, 1)
+    share = w / np.maximum(w.sum(axis=2, keepdims=True), 1e-300)
+    v = np.moveaxis(value, 3, 1)
+    mean = np.einsum("fqci,fqcik->fqik", share, v)
+    own = w.sum(axis=3)
+    matrix = (
+        -w @ np.swapaxes(share, 2, 3)
+        + own[..., None] * own[..., None, :] / np.maximum(own.sum(axis=2), 1e-300)[..., None, None]
+    )
+    diagonal = np.arange(w.shape[2])
+    matrix[..., diagonal, diagonal] += np.where(own > 0.0, own, 1.0)
+    clock = np.linalg.solve(matrix, np.einsum("fqci,fqcik->fqck", w, v - mean[:, :, None]))
+    mean = mean - np.einsum("fqci,fqck->fqik", share, clock)
+    return np.moveaxis(mean, 1, 2), np.moveaxis(clock, 1, 2)
 
 
 def _align(phase: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -147,6 +293,7 @@ def _align(phase: FloatArray, sigma: FloatArray) -> FloatArray:
                 weight = 1.0 / sigma[f, both, q] ** 2
                 step = wrap(row[both] - last[both])
                 common = float(np.angle(np.sum(weight * np.exp(1j * step))))
+                common += float(np.average(wrap(step - common), weights=weight))
                 row -= common
                 row[both] = last[both] + wrap(row[both] - last[both])
             last = np.where(np.isfinite(row), row, last)
@@ -165,6 +312,27 @@ def _drift_rate(aligned: FloatArray, sigma: FloatArray, time_s: FloatArray) -> F
             excess = np.mean(step[:, :, q][used] ** 2 - noise[:, :, q][used])
             rate[q] = np.sqrt(max(0.0, float(excess)) / float(np.mean(dt)))
     return rate
+
+
+def _sources(
+    measured: npt.NDArray[np.bool_], time_s: FloatArray
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], FloatArray]:
+    """Frames before and after from which a transmitter's phase comes, and the share of the one after.
+
+    All (frame, transmitter). Both are the frame itself where it was measured or where it never was, and the nearest
+    one where it was measured on one side only.
+    """
+    n_frame = len(measured)
+    index = np.arange(n_frame)[:, None]
+    before = np.maximum.accumulate(np.where(measured, index, -1), axis=0)
+    after = np.minimum.accumulate(np.where(measured, index, n_frame)[::-1], axis=0)[::-1]
+    never = (before < 0) & (after >= n_frame)
+    one_sided = np.where(before < 0, after, before)
+    before = np.where(never, index, one_sided)
+    after = np.where(never, index, np.where(after >= n_frame, one_sided, after))
+    gap = time_s[after] - time_s[before]
+    share = np.where(after > before, (time_s[:, None] - time_s[before]) / np.where(after > before, gap, 1.0), 0.0)
+    return before, after, np.asarray(share)
 
 
 def interpolate_phase(
@@ -196,19 +364,16 @@ def interpolate_phase(
     aligned = _align(phase, sigma)
     rate = _drift_rate(aligned, sigma, time)
     out, out_sigma = phase.copy(), sigma.copy()
+    before, after, shares = _sources(measured, time)
+    # a frame with no measured transmitter at all still has no clock to be aligned to; any datum will do
     for f, i in np.argwhere(~measured):
-        known = np.flatnonzero(measured[:, i])
-        # a frame with no measured transmitter at all still has no clock to be aligned to; any datum will do
-        before, after = known[known < f], known[known > f]
-        if before.size and after.size:
-            a, b = before[-1], after[0]
-            share = (time[f] - time[a]) / (time[b] - time[a])
+        a, b, share = before[f, i], after[f, i], shares[f, i]
+        if a != b:
             out[f, i] = wrap((1 - share) * aligned[a, i] + share * aligned[b, i])
             bridge = rate**2 * (time[f] - time[a]) * (time[b] - time[f]) / (time[b] - time[a])
             out_sigma[f, i] = np.sqrt(((1 - share) * sigma[a, i]) ** 2 + (share * sigma[b, i]) ** 2 + bridge)
             status[f, i] = CalibrationStatus.INTERPOLATED
-        elif known.size and np.all(np.isfinite(rate)):
-            a = int(before[-1]) if before.size else int(after[0])
+        elif a != f and np.all(np.isfinite(rate)):
             out[f, i] = wrap(aligned[a, i])
             out_sigma[f, i] = np.sqrt(sigma[a, i] ** 2 + rate**2 * abs(time[f] - time[a]))
             status[f, i] = CalibrationStatus.EXTRAPOLATED
@@ -219,6 +384,46 @@ def interpolate_phase(
         if np.any((status[f] == CalibrationStatus.INTERPOLATED) | (status[f] == CalibrationStatus.EXTRAPOLATED)):
             out[f, measured[f]] = wrap(aligned[f, measured[f]])
     return out, out_sigma, rate, status
+
+
+def phase_average(
+    phase_rad: FloatArray, sigma_rad: FloatArray, scenario: Scenario, time_s: FloatArray | None = None
+) -> PhaseAverage:
+    """Electronic phases as a scenario's calibration receivers see them.
+
+    Parameters
+    ----------
+    phase_rad, sigma_rad : (frame, receiver, transmitter, tone)
+        Of all receivers along the scenario's receiver axis [rad]; NaN = not received.
+    scenario
+        Places of the calibration receivers and transmitters.
+    time_s : (frame,), optional
+        As in `PhaseAverage`.
+
+    Raises
+    ------
+    InvalidInputError
+        The scenario has no calibration receiver.
+    """
+    rows = [i for i, receiver in enumerate(scenario.receivers) if receiver.calibration is not None]
+    if not rows:
+        raise InvalidInputError("`scenario` must name at least one calibration receiver")
+    average = average_phases(
+        phase_rad[:, rows],
+        sigma_rad[:, rows],
+        calibration_enu_m=scenario.calibration_enu_m,
+        transmitter_enu_m=scenario.transmitter_enu_m,
+        wavelength_m=scenario.wavelength_m,
+        survey_sigma_m=[r.survey_sigma_m for r in scenario.calibration_receiver],
+    )
+    return replace(average, time_s=time_s)
+
+
+def frame_times(tones: TonePhases, scenario: Scenario) -> FloatArray:
+    """(frame,) time since the first frame [s]."""
+    rate_hz = as_positive("sample_rate_hz", scenario.radio.sample_rate_hz)
+    index = tones.frame_start_index
+    return np.asarray((index - (index[0] if len(index) else 0)) / rate_hz)
 
 
 def calibrate(tones: TonePhases, scenario: Scenario) -> Calibration:
@@ -236,19 +441,6 @@ def calibrate(tones: TonePhases, scenario: Scenario) -> Calibration:
     InvalidInputError
         The scenario has no calibration receiver.
     """
-    rows = [i for i, receiver in enumerate(scenario.receivers) if receiver.calibration is not None]
-    if not rows:
-        raise InvalidInputError("`scenario` must name at least one calibration receiver")
-    phase, sigma = electronic_phase(
-        tones.phase_rad[:, rows],
-        tones.sigma_rad[:, rows],
-        calibration_enu_m=scenario.calibration_enu_m,
-        transmitter_enu_m=scenario.transmitter_enu_m,
-        wavelength_m=scenario.wavelength_m,
-        survey_sigma_m=[r.survey_sigma_m for r in scenario.calibration_receiver],
-    )
-    rate_hz = as_positive("sample_rate_hz", scenario.radio.sample_rate_hz)
-    index = tones.frame_start_index
-    time_s = (index - (index[0] if len(index) else 0)) / rate_hz
-    phase, sigma, drift, status = interpolate_phase(phase, sigma, time_s)
+    average = phase_average(tones.phase_rad, tones.sigma_rad, scenario)
+    phase, sigma, drift, status = interpolate_phase(average.phase_rad, average.sigma_rad, frame_times(tones, scenario))
     return Calibration(phase_rad=phase, sigma_rad=sigma, drift_rad_per_sqrt_s=drift, status=status)

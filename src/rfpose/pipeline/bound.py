@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.dsp.calibration import phase_average
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat import normal_bound
 from rfpose.multilat.ground import ground_bound
@@ -16,7 +17,7 @@ from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice, reflectors_of
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
-    calibration_share,
+    calibration_sight,
     carrier_rf_hz,
     group_hz,
     is_calibrated,
@@ -121,7 +122,9 @@ def _rigid(
         )
     reflectors = reflectors_of(scenario, choice.reflection)
     truth = np.zeros(len(reflectors), np.complex128) if coefficient is None else np.asarray(coefficient)
+    n_helio = len(group.column)
     row = np.arange(len(rot)).reshape(n_frame, -1)
+    average = phase_average(np.where(np.isfinite(noise.tone_rad), 0.0, np.nan), noise.tone_rad, scenario)
     shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
     out = np.full((len(rot), *2 * (6 + sigma.shape[1] * sigma.shape[2],)), np.nan)
     for rows in shared:
@@ -137,8 +140,7 @@ def _rigid(
             tone_hz=group_hz(scenario, group),
             reflectors=reflectors,
             coefficient=[complex(c) for c in truth],
-            calibration_enu_m=scenario.calibration_enu_m,
-            calibration_share=calibration_share(noise.tone_rad, scenario),
+            calibration_enu_m=calibration_sight(average, scenario, rows // n_helio),
             knowledge=known,
             free_space=scenario.reflection.spreading == "free_space",
             propagation_speed_mps=scenario.radio.propagation_speed_mps,

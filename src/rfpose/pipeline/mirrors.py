@@ -11,14 +11,16 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp.calibration import PhaseAverage
 from rfpose.multilat import RangeDifferences
+from rfpose.multilat.ground import CalibrationSight
 from rfpose.multilat.rigid import Knowledge
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.scenario import Heliostat, Scenario
 
 __all__ = [
     "MirrorGroup",
-    "calibration_share",
+    "calibration_sight",
     "carrier_rf_hz",
     "group_hz",
     "is_calibrated",
@@ -207,22 +209,24 @@ def _coarse_uncalibrated(z: FloatArray, wavelength: float) -> FloatArray:
     return np.asarray(left - wavelength * np.rint(left / wavelength) + common + clock)
 
 
-def calibration_share(sigma_rad: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return each calibration receiver's share of the mean that electronic phases are (calibration, transmitter).
+def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDArray[np.int64]) -> CalibrationSight:
+    """Return how the calibration receivers' reflections get into ranges.
 
     Parameters
     ----------
-    sigma_rad : (frame, receiver, transmitter, tone)
-        Of the tones; shares are averaged over frames and tones.
+    average
+        Of these receivers' phases.
     scenario
-        Its surveys count.
+    frame : (mirror,)
+        Of each mirror that is to be solved.
     """
-    is_calibration = np.array([r.calibration is not None for r in scenario.receivers], bool)
-    survey = np.array([r.survey_sigma_m for r in scenario.calibration_receiver])
-    wavenumber = 2.0 * np.pi / scenario.wavelength_m
-    variance = sigma_rad[:, is_calibration] ** 2 + (survey[:, None, None] * wavenumber) ** 2
-    weight = np.where(np.isfinite(variance), 1.0 / np.where(np.isfinite(variance), variance, 1.0), 0.0)
-    share = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-300)
-    mean = share.mean(axis=(0, 3))
-    total = mean.sum(axis=0, keepdims=True)
-    return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 1.0 / len(mean)))
+    order = np.argsort(-scenario.wavelength_m)
+    per_m = (2.0 * np.pi / scenario.wavelength_m)[:, None]
+
+    def change_m(shift_m: FloatArray, frames: npt.NDArray[np.int64]) -> FloatArray:
+        shift = np.zeros(shift_m.shape)
+        shift[:, :, order] = shift_m
+        # a longer path turns a phase back: Φ without the shifts is what receivers' phases turned forward give
+        return (average.change_rad(per_m * shift, frames) / per_m)[:, :, order]
+
+    return CalibrationSight(place_enu_m=scenario.calibration_enu_m, frame=frame, change_m=change_m)

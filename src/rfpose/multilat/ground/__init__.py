@@ -1,5 +1,6 @@
 """Poses of rigid mirrors where ground or walls reflect."""
 
+from rfpose.multilat.ground._problem import CalibrationSight
 from rfpose.multilat.ground.bound import ground_bound
 from rfpose.multilat.ground.guard import guard_with_ground
 from rfpose.multilat.ground.model import LEVEL_GROUND, Reflector, Surface, fresnel_coefficient, range_shift_m
@@ -7,6 +8,7 @@ from rfpose.multilat.ground.solve import GroundSolution, GroundStatus, solve_wit
 
 __all__ = [
     "LEVEL_GROUND",
+    "CalibrationSight",
     "GroundSolution",
     "GroundStatus",
     "Reflector",

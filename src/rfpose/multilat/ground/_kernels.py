@@ -35,8 +35,8 @@ class Scene(NamedTuple):
 
     ``image`` (plane, transmitter, 3) and ``normal`` (plane, 3); ``tone_k`` (group,) is zero for the carrier;
     ``kind`` (plane,) 0 = coefficient only, 1 = vertical, 2 = horizontal polarisation; ``permittivity`` (plane,
-    transmitter); ``column`` (plane,) gives a coefficient's first parameter, −1 = known; ``common`` (transmitter, group,
-    4 + parameter) is `shift_at` the calibration receivers, which their phases carry.
+    transmitter); ``column`` (plane,) gives a coefficient's first parameter, −1 = known; ``common`` (frame, transmitter,
+    group, 1 + parameter) is what calibration receivers' phases carry of it, as range and its derivatives.
     """
 
     transmitter: Float64
@@ -53,7 +53,10 @@ class Scene(NamedTuple):
 
 
 class Mirrors(NamedTuple):
-    """Measurements and knowledge of many mirrors, as in the rigid body's kernels; mirror is the first axis."""
+    """Measurements and knowledge of many mirrors, as in the rigid body's kernels; mirror is the first axis.
+
+    ``frame`` (mirror,) is each one's row of the scene's ``common``.
+    """
 
     receiver_mirror: Float64
     z: Float64
@@ -66,6 +69,7 @@ class Mirrors(NamedTuple):
     clock_own: Float64
     clock_tie: Float64
     clock_prior: Float64
+    frame: Int64
 
 
 class Work(NamedTuple):
@@ -215,9 +219,9 @@ def shifts_at_points(scene, point, out):
 
 
 @kernel
-def predict(scene, work, receiver_mirror, pivot, rot, predicted, slope):
+def predict(scene, common, work, receiver_mirror, pivot, rot, predicted, slope):
     """Ranges (group, receiver, transmitter) and derivatives (…, 6 + parameter), less what the calibration carries."""
-    transmitter, common = scene.transmitter, scene.common
+    transmitter = scene.transmitter
     n_group = scene.tone_k.shape[0]
     n_parameter = slope.shape[3] - 6
     shift = np.zeros((n_group, 4 + n_parameter))
@@ -241,7 +245,7 @@ def predict(scene, work, receiver_mirror, pivot, rot, predicted, slope):
                 slope[g, r, i, 4] = az * sx - ax * sz
                 slope[g, r, i, 5] = ax * sy - ay * sx
                 for c in range(n_parameter):
-                    slope[g, r, i, 6 + c] = shift[g, 4 + c] - common[i, g, 4 + c]
+                    slope[g, r, i, 6 + c] = shift[g, 4 + c] - common[i, g, 1 + c]
 
 
 @kernel
@@ -374,6 +378,7 @@ def _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock):
 def _fit(scene, mirrors, m, max_iteration, floor, pivot, rot, clock, cov, follow, schur, rest):
     """Gauss-Newton with step halving of mirror ``m`` at given coefficients; (chi², iterations, status)."""
     z = mirrors.z[m]
+    common = scene.common[mirrors.frame[m]]
     n_class, n_receiver = clock.shape
     n_parameter = schur.shape[0]
     n_own = 6 + n_class * n_receiver
@@ -392,7 +397,7 @@ def _fit(scene, mirrors, m, max_iteration, floor, pivot, rot, clock, cov, follow
     used = 0
     for iteration in range(max_iteration):
         used = iteration + 1
-        predict(scene, work, mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
+        predict(scene, common, work, mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
         chi2 = normal_equations(
             z, mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock, info, gradient
         )
@@ -548,7 +553,9 @@ def fit_many(
 
 
 @kernel_parallel
-def predict_many(scene, receiver_mirror, pivot, rot, predicted, slope):
+def predict_many(scene, frame, receiver_mirror, pivot, rot, predicted, slope):
     """`predict` for every mirror."""
     for m in numba.prange(pivot.shape[0]):
-        predict(scene, _work(scene.image.shape[0]), receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])
+        common = scene.common[frame[m]]
+        work = _work(scene.image.shape[0])
+        predict(scene, common, work, receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])

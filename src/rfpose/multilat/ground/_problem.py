@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -15,13 +15,49 @@ from rfpose.multilat.rigid.arrays import bias_information, clock_ties, pivot_pri
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.multilat.rigid.knowledge import Knowledge
 
-__all__ = ["Problem", "State", "build", "calibration_of"]
+__all__ = ["CalibrationSight", "Problem", "State", "build"]
 
 IntArray = npt.NDArray[np.int64]
 
 MAX_ITERATION = 30
 _FLOOR = 1e-13
 NO_TURN: FloatArray = np.zeros((1, 3))
+
+
+def plain_mean(shift_m: FloatArray, frames: IntArray) -> FloatArray:
+    """`CalibrationSight.change_m` of receivers that count alike in every frame."""
+    return np.broadcast_to(shift_m.mean(axis=0), (len(frames), *shift_m.shape[1:]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationSight:
+    """Receivers whose phases make the electronic phases Φ, and so carry their own reflections into all ranges.
+
+    Attributes
+    ----------
+    place_enu_m : (calibration receiver, xyz)
+        [m]; empty where there is no calibration.
+    frame : (mirror,)
+        Frame of each mirror. None: all of one.
+    change_m
+        How ranges change that Φ is taken off, where the ranges of each receiver are changed by ``shift_m`` (calibration
+        receiver, transmitter, tone, 1 + parameter) first: a range and its derivatives. Called with that and with frames
+        (row,), it returns (row, transmitter, tone, 1 + parameter), up to one constant a row and tone. Tones are in the
+        observations' order. Exact at any size: Φ is no linear mean of phases that differ by turns.
+    """
+
+    place_enu_m: FloatArray
+    frame: IntArray | None = None
+    change_m: Callable[[FloatArray, IntArray], FloatArray] = plain_mean
+
+    @classmethod
+    def checked(cls, sight: CalibrationSight | npt.ArrayLike | None) -> CalibrationSight:
+        """Return a caller's; places alone mean a plain mean."""
+        if sight is None:
+            return cls(place_enu_m=np.empty((0, 3)))
+        if isinstance(sight, CalibrationSight):
+            return sight
+        return cls(place_enu_m=as_float_array("calibration_enu_m", sight, ("calibration receiver", 3)))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -95,19 +131,22 @@ class Problem:
     scene
         Coefficients given are in it; estimated ones are put in by `fit`.
     mirrors
-    calibration : (calibration receiver, xyz)
-        [m]; empty where Φ does not carry their reflections.
-    calibration_share : (calibration receiver, transmitter)
-        What each has of the mean that Φ is.
+    calibration
+        Whose reflections Φ carries.
     dof : (mirror,)
         Measurements and priors less a mirror's own unknowns.
     """
 
     scene: _kernels.Scene
     mirrors: _kernels.Mirrors
-    calibration: FloatArray
-    calibration_share: FloatArray
+    calibration: CalibrationSight
     dof: FloatArray
+
+    @property
+    def frames(self) -> IntArray:
+        """(row,) frames of the mirrors, in the order that ``mirrors.frame`` counts."""
+        given = self.calibration.frame
+        return np.zeros(1, np.int64) if given is None else np.unique(given)
 
     @property
     def n_parameter(self) -> int:
@@ -131,19 +170,31 @@ class Problem:
         mirrors = m._replace(
             **{name: getattr(m, name)[rows] for name in m._fields if name not in ("clock_class", "roll_info")}
         )
-        return replace(self, mirrors=mirrors, dof=self.dof[rows])
+        calibration = self.calibration
+        if calibration.frame is not None:
+            frame = calibration.frame[rows]
+            calibration, mirrors = replace(calibration, frame=frame), mirrors._replace(frame=_rank(frame))
+        return replace(self, mirrors=mirrors, calibration=calibration, dof=self.dof[rows])
 
     def scene_at(self, parameter: FloatArray) -> _kernels.Scene:
-        """Return the scene with estimated coefficients put in, and with what the calibration receivers see of them."""
+        """Return the scene with estimated coefficients put in, and with what the calibration carries of them.
+
+        Carriers have none of it: what is common to a mirror's receivers is unknown there anyway.
+        """
         coefficient = self.scene.coefficient.copy()
         free = self.scene.column >= 0
         coefficient[free] = parameter[0::2] + 1j * parameter[1::2]
         scene = self.scene._replace(coefficient=coefficient)
-        if len(self.calibration) and len(coefficient):
-            seen = np.zeros((len(self.calibration), *scene.common.shape))
-            _kernels.shifts_at_points(scene, self.calibration, seen)
-            scene = scene._replace(common=np.einsum("ci,cigk->igk", self.calibration_share, seen))
-        return scene
+        place = self.calibration.place_enu_m
+        if not (len(place) and len(coefficient)):
+            return scene
+        n_transmitter, n_group, n_value = scene.common.shape[1:]
+        seen = np.zeros((len(place), n_transmitter, n_group, 3 + n_value))
+        _kernels.shifts_at_points(scene, place, seen)
+        tones = np.flatnonzero(scene.tone_k)
+        common = np.zeros((len(self.frames), n_transmitter, n_group, n_value))
+        common[:, :, tones] = self.calibration.change_m(np.delete(seen, (1, 2, 3), axis=3)[:, :, tones], self.frames)
+        return scene._replace(common=common)
 
     def fit(
         self,
@@ -183,16 +234,18 @@ class Problem:
         predicted = np.empty(self.mirrors.z.shape)
         slope = np.empty((*predicted.shape, 6 + self.n_parameter))
         scene = self.scene_at(parameter)
-        _kernels.predict_many(scene, self.mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope)
+        mirrors = self.mirrors
+        _kernels.predict_many(scene, mirrors.frame, mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope)
         return predicted, slope
 
     def direct(self) -> Problem:
         """Leave all reflections out."""
         scene = self.scene
-        n_transmitter, n_group, _ = scene.common.shape
+        n_transmitter, n_group, _ = scene.common.shape[1:]
         return replace(
             self,
-            calibration=np.empty((0, 3)),
+            calibration=CalibrationSight(place_enu_m=np.empty((0, 3))),
+            mirrors=self.mirrors._replace(frame=np.zeros_like(self.mirrors.frame)),
             scene=scene._replace(
                 image=scene.image[:0],
                 normal=scene.normal[:0],
@@ -200,7 +253,7 @@ class Problem:
                 permittivity=scene.permittivity[:0],
                 coefficient=scene.coefficient[:0],
                 column=scene.column[:0],
-                common=np.zeros((n_transmitter, n_group, 4)),
+                common=np.zeros((1, n_transmitter, n_group, 1)),
             ),
         )
 
@@ -213,11 +266,11 @@ def build(
     pivot: FloatArray,
     rot: FloatArray,
     *,
-    calibration: FloatArray,
+    calibration: CalibrationSight | npt.ArrayLike | None,
     known: Knowledge,
-    calibration_share: FloatArray | None = None,
 ) -> tuple[Problem, FloatArray]:
     """Lay out observations with their integers resolved; also clocks (mirror, class, receiver) that fit the poses."""
+    calibration = CalibrationSight.checked(calibration)
     z = np.stack(range_m, axis=1)
     n_mirror, n_group, _, n_transmitter = z.shape
     weight = weights(z, np.stack([np.broadcast_to(o.sigma_m, z[:, 0].shape) for o in observations], axis=1))
@@ -243,25 +296,15 @@ def build(
         clock_own=own,
         clock_tie=tie,
         clock_prior=clock.copy(),
+        frame=np.zeros(n_mirror, np.int64) if calibration.frame is None else _rank(calibration.frame),
     )
     dof = _dof(weight, bias_info, seen, classes, known)
-    if calibration_share is None:
-        _, calibration_share = calibration_of(calibration, None, n_transmitter)
-    return Problem(
-        scene=scene, mirrors=mirrors, calibration=calibration, calibration_share=calibration_share, dof=dof
-    ), clock
+    return Problem(scene=scene, mirrors=mirrors, calibration=calibration, dof=dof), clock
 
 
-def calibration_of(
-    calibration_enu_m: npt.ArrayLike | None, calibration_share: npt.ArrayLike | None, n_transmitter: int
-) -> tuple[FloatArray, FloatArray]:
-    """Calibration receivers (calibration receiver, xyz), and their shares of Φ (calibration receiver, transmitter)."""
-    if calibration_enu_m is None:
-        return np.empty((0, 3)), np.empty((0, n_transmitter))
-    place = as_float_array("calibration_enu_m", calibration_enu_m, ("calibration receiver", 3))
-    if calibration_share is None:
-        return place, np.full((len(place), n_transmitter), 1.0 / max(len(place), 1))
-    return place, as_float_array("calibration_share", calibration_share, (len(place), n_transmitter))
+def _rank(frame: IntArray) -> IntArray:
+    """Return each frame's place among those there are."""
+    return np.asarray(np.unique(frame, return_inverse=True)[1].reshape(-1), np.int64)
 
 
 def _dof(

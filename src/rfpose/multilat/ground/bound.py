@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.ground import _coefficients
-from rfpose.multilat.ground._problem import State, build, calibration_of
+from rfpose.multilat.ground._problem import CalibrationSight, State, build
 from rfpose.multilat.ground.model import SPEED_OF_LIGHT_MPS, Reflector, build_scene
 from rfpose.multilat.ground.solve import joint_covariance
 from rfpose.multilat.rigid.arrays import spread_places
@@ -33,8 +33,7 @@ def ground_bound(
     tone_hz: npt.ArrayLike,
     reflectors: Sequence[Reflector],
     coefficient: Sequence[complex],
-    calibration_enu_m: npt.ArrayLike | None = None,
-    calibration_share: npt.ArrayLike | None = None,
+    calibration_enu_m: CalibrationSight | npt.ArrayLike | None = None,
     knowledge: Knowledge | None = None,
     free_space: bool = True,
     propagation_speed_mps: float = SPEED_OF_LIGHT_MPS,
@@ -45,7 +44,7 @@ def ground_bound(
     ----------
     transmitter_enu_m, receiver_mirror_m, pivot_enu_m, rot_enu_from_mirror, sigma_m, transmitter_sigma_m, clock_class
         As in `rfpose.multilat.rigid.full_covariance`.
-    carrier_rf_hz, reflectors, calibration_enu_m, calibration_share, knowledge, free_space, propagation_speed_mps
+    carrier_rf_hz, reflectors, calibration_enu_m, knowledge, free_space, propagation_speed_mps
         As in `rfpose.multilat.ground.solve_with_ground`; a reflector without a coefficient counts as estimated.
     tone_hz : (group,)
         [Hz]; zero = the carrier's own phase.
@@ -73,7 +72,6 @@ def ground_bound(
         free_space=free_space,
         propagation_speed_mps=propagation_speed_mps,
     )
-    calibration, share = calibration_of(calibration_enu_m, calibration_share, n_transmitter)
     seen = np.where(np.isfinite(sigma), 0.0, np.nan)
     classes = np.asarray(clock_class, np.int64)
     observations = [
@@ -95,8 +93,7 @@ def ground_bound(
         [o.range_m for o in observations],
         pivot,
         rot,
-        calibration=calibration,
-        calibration_share=share,
+        calibration=calibration_enu_m,
         known=known,
     )
     # measurements exactly as predicted: the solver stops where it starts and hands on its information

@@ -233,7 +233,7 @@ def build_scene(
         spreads=free_space,
         coefficient=coefficient,
         column=column,
-        common=np.zeros((n_transmitter, len(tone_hz), 4 + free)),
+        common=np.zeros((1, n_transmitter, len(tone_hz), 1 + free)),
     )
 
 

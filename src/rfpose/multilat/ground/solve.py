@@ -20,7 +20,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._coefficients import MAX_CONDITION
-from rfpose.multilat.ground._problem import NO_TURN, Problem, State, build, calibration_of
+from rfpose.multilat.ground._problem import NO_TURN, CalibrationSight, Problem, State, build
 from rfpose.multilat.ground.integers import resolve
 from rfpose.multilat.ground.model import (
     LEVEL_GROUND,
@@ -126,8 +126,7 @@ def solve_with_ground(
     start_pivot_enu_m: npt.ArrayLike,
     start_rot_enu_from_mirror: npt.ArrayLike,
     reflectors: Sequence[Reflector] = (LEVEL_GROUND,),
-    calibration_enu_m: npt.ArrayLike | None = None,
-    calibration_share: npt.ArrayLike | None = None,
+    calibration_enu_m: CalibrationSight | npt.ArrayLike | None = None,
     tone_count: int | None = None,
     knowledge: Knowledge | None = None,
     free_space: bool = True,
@@ -152,10 +151,9 @@ def solve_with_ground(
         Where to begin; NaN gives status NO_START.
     reflectors
         Planes; those without a coefficient are estimated. None at all: the direct ray alone.
-    calibration_enu_m : (calibration receiver, xyz), optional
-        Where Φ was measured, as the mean of these receivers: the reflections there are in the ranges, and are modelled.
-    calibration_share : (calibration receiver, transmitter), optional
-        What each has of that mean; they add up to one. Default: a plain mean.
+    calibration_enu_m : `CalibrationSight`, or (calibration receiver, xyz), optional
+        Where Φ was measured, and how it became of several receivers; places alone mean their plain mean. The
+        reflections there are in the ranges, and are modelled.
     tone_count
         How many observations are tones; the rest are carriers. Default: those with ``clock_class`` 0.
     knowledge
@@ -193,10 +191,9 @@ def solve_with_ground(
         free_space=free_space,
         propagation_speed_mps=speed,
     )
-    calibration, share = calibration_of(calibration_enu_m, calibration_share, len(transmitter))
 
     def lay_out(count: int, ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> tuple[Problem, FloatArray]:
-        used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :count].copy())
+        used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :, :count].copy())
         return build(
             used,
             places,
@@ -204,8 +201,7 @@ def solve_with_ground(
             ranges[:count],
             pivot,
             rot,
-            calibration=calibration,
-            calibration_share=share,
+            calibration=calibration_enu_m,
             known=known,
         )
 

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.dsp.calibration import frame_times, phase_average
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.ground import GroundSolution, GroundStatus, guard_with_ground, solve_with_ground
+from rfpose.multilat.ground import CalibrationSight, GroundSolution, GroundStatus, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import Knowledge, RigidPoses, solve_rigid
 from rfpose.multilat.rigid.integers import IntegerMethod, Observation
 from rfpose.pipeline.choice import reflectors_of
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
-    calibration_share,
+    calibration_sight,
     carrier_rf_hz,
 )
 from rfpose.pipeline.rigid.found import (
@@ -58,13 +59,50 @@ def solve_two_ray(stages: Stages, group: MirrorGroup) -> Found:
     surveyed = np.tile(group.pivot_enu_m, (n_frame, 1))
     start, rot = _better_start(scenario, places, phases, start, rot, surveyed, known)
     row = np.arange(n_frame * n_helio).reshape(n_frame, n_helio)
+    tones = stages.tones
+    average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
+    everyone = _Mirrors(
+        places=places,
+        phases=phases,
+        pivot=start,
+        rot=rot,
+        known=known,
+        helio=row.ravel() % n_helio,
+        calibration=calibration_sight(average, scenario, row.ravel() // n_helio),
+    )
     shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
-    parts = []
-    for rows in shared:
-        mine = known if known.pivot_enu_m is None else replace(known, pivot_enu_m=known.pivot_enu_m[rows])
-        these = [rows_of(o, rows) for o in phases]
-        parts.append(_two_ray_of(stages, places[rows], these, start[rows], rot[rows], mine, rows % n_helio))
+    parts = [_two_ray_of(stages, everyone.take(rows)) for rows in shared]
     return _in_order(parts, np.argsort(np.concatenate(shared)), known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Mirrors:
+    """Mirrors to be solved together, and where each begins; first axis mirror."""
+
+    places: FloatArray
+    phases: list[Observation]
+    pivot: FloatArray
+    rot: FloatArray
+    known: Knowledge
+    helio: IntArray
+    calibration: CalibrationSight
+
+    def take(self, rows: IntArray) -> _Mirrors:
+        """Select some."""
+        known, calibration = self.known, self.calibration
+        if known.pivot_enu_m is not None:
+            known = replace(known, pivot_enu_m=known.pivot_enu_m[rows])
+        if calibration.frame is not None:
+            calibration = replace(calibration, frame=calibration.frame[rows])
+        return _Mirrors(
+            places=self.places[rows],
+            phases=[rows_of(o, rows) for o in self.phases],
+            pivot=self.pivot[rows],
+            rot=self.rot[rows],
+            known=known,
+            helio=self.helio[rows],
+            calibration=calibration,
+        )
 
 
 def _better_start(
@@ -96,15 +134,7 @@ def _better_start(
     return np.where(np.isfinite(rot).all(axis=2), surveyed, np.nan), rot
 
 
-def _two_ray_of(
-    stages: Stages,
-    places: FloatArray,
-    phases: list[Observation],
-    start: FloatArray,
-    rot: FloatArray,
-    known: Knowledge,
-    helio: IntArray,
-) -> Found:
+def _two_ray_of(stages: Stages, mirrors: _Mirrors) -> Found:
     """Solve mirrors that share their coefficients; where a test finds something to leave out, once more without."""
     table = stages.scenario.integrity
 
@@ -116,19 +146,23 @@ def _two_ray_of(
             max_excluded=table.max_excluded,
         )
 
-    before = rot
-    solution = _solve_ground(stages, places, phases, start, rot, known)
-    start, rot = _again(stages, solution, helio, places, phases, start, rot, known)
-    if not np.array_equal(rot, before):
-        solution = _solve_ground(stages, places, phases, start, rot, known)
+    solution = _solve_ground(stages, mirrors)
+    better = _again(stages, solution, mirrors)
+    if not np.array_equal(mirrors.rot, better.rot):
+        solution = _solve_ground(stages, better)
     probability_all, probability_direct = solution.probability, solution.probability_direct
     guard: GuardedPoses | None = None
     if stages.choice.integrity:
         guard = guarded(solution)
         if np.any(guard.transmitter_status > TransmitterStatus.NOT_RECEIVED):
             first = guard
-            at, at_rot = where_known(first.poses.pivot_enu_m, start), where_known(first.poses.rot_enu_from_mirror, rot)
-            solution = _solve_ground(stages, places, keep_where(phases, first.used), at, at_rot, known)
+            kept = replace(
+                better,
+                phases=keep_where(mirrors.phases, first.used),
+                pivot=where_known(first.poses.pivot_enu_m, better.pivot),
+                rot=where_known(first.poses.rot_enu_from_mirror, better.rot),
+            )
+            solution = _solve_ground(stages, kept)
             guard = joined(first, guarded(solution))
     poses = solution.poses if guard is None else guard.poses
     status = np.array([_GROUND_STATUS[GroundStatus(s)] for s in solution.status], np.int64)
@@ -136,7 +170,7 @@ def _two_ray_of(
         explained = np.isfinite(guard.protection_level_rad) | (guard.status == IntegrityStatus.NO_REDUNDANCY)
         status[(status == PoseStatus.UNEXPLAINED) & explained] = PoseStatus.OK
         status[(status == PoseStatus.OK) & are_doubted(guard)] = PoseStatus.UNEXPLAINED
-    n, n_plane = len(places), len(solution.coefficient)
+    n, n_plane = len(mirrors.places), len(solution.coefficient)
     sigma = np.zeros((n_plane, 2))
     estimated = [p for p, r in enumerate(reflectors_of(stages.scenario, stages.choice.reflection)) if r.estimated]
     sigma[estimated] = np.sqrt(np.diag(solution.coefficient_cov)).reshape(-1, 2)
@@ -146,8 +180,8 @@ def _two_ray_of(
         fixed=solution.fixed,
         wrong_risk=solution.wrong_risk,
         method=np.where(solution.fixed, IntegerMethod.ROUNDED, IntegerMethod.FLOAT),
-        ranges=[replace(o, range_m=z) for o, z in zip(phases, solution.range_m, strict=True)],
-        known=known,
+        ranges=[replace(o, range_m=z) for o, z in zip(mirrors.phases, solution.range_m, strict=True)],
+        known=mirrors.known,
         full_cov=solution.full_cov,
         guard=guard,
         probability_all=probability_all,
@@ -157,16 +191,7 @@ def _two_ray_of(
     )
 
 
-def _again(
-    stages: Stages,
-    solution: GroundSolution,
-    helio: IntArray,
-    places: FloatArray,
-    phases: list[Observation],
-    start: FloatArray,
-    rot: FloatArray,
-    known: Knowledge,
-) -> tuple[FloatArray, FloatArray]:
+def _again(stages: Stages, solution: GroundSolution, mirrors: _Mirrors) -> _Mirrors:
     """Return better poses to begin with for mirrors that ended in a false minimum, where any mirror did not.
 
     With the coefficients of those that fit, each other one is tried from the same mirror's pose in another frame, or
@@ -175,38 +200,23 @@ def _again(
     good = solution.status == GroundStatus.OK
     lost = np.flatnonzero(np.isin(solution.status, (GroundStatus.RESIDUAL, GroundStatus.NOT_CONVERGED)))
     if not lost.size or not good.any():
-        return start, rot
-    pivot, turned = start.copy(), rot.copy()
+        return mirrors
+    pivot, turned = mirrors.pivot.copy(), mirrors.rot.copy()
     pivot[good], turned[good] = solution.poses.pivot_enu_m[good], solution.poses.rot_enu_from_mirror[good]
     for m in lost:
-        frames = np.flatnonzero(good & (helio == helio[m]))
+        frames = np.flatnonzero(good & (mirrors.helio == mirrors.helio[m]))
         if frames.size:
             nearest = frames[np.argmin(np.abs(frames - m))]
             pivot[m], turned[m] = pivot[nearest], turned[nearest]
-    mine = known if known.pivot_enu_m is None else replace(known, pivot_enu_m=known.pivot_enu_m[lost])
-    found = _solve_ground(
-        stages,
-        places[lost],
-        [rows_of(o, lost) for o in phases],
-        pivot[lost],
-        turned[lost],
-        mine,
-        coefficient=solution.coefficient,
-    )
+    better = replace(mirrors, pivot=pivot, rot=turned)
+    found = _solve_ground(stages, better.take(lost), coefficient=solution.coefficient)
     fits = found.status == GroundStatus.OK
     pivot[lost[fits]], turned[lost[fits]] = found.poses.pivot_enu_m[fits], found.poses.rot_enu_from_mirror[fits]
-    return pivot, turned
+    return better
 
 
 def _solve_ground(
-    stages: Stages,
-    places: FloatArray,
-    phases: list[Observation],
-    start: FloatArray,
-    rot: FloatArray,
-    known: Knowledge,
-    *,
-    coefficient: npt.NDArray[np.complex128] | None = None,
+    stages: Stages, mirrors: _Mirrors, *, coefficient: npt.NDArray[np.complex128] | None = None
 ) -> GroundSolution:
     scenario = stages.scenario
     reflectors = reflectors_of(scenario, stages.choice.reflection)
@@ -214,16 +224,15 @@ def _solve_ground(
         reflectors = tuple(replace(r, coefficient=complex(c)) for r, c in zip(reflectors, coefficient, strict=True))
     return solve_with_ground(
         scenario.transmitter_enu_m,
-        places,
-        phases,
+        mirrors.places,
+        mirrors.phases,
         carrier_rf_hz=carrier_rf_hz(scenario),
-        start_pivot_enu_m=start,
-        start_rot_enu_from_mirror=rot,
+        start_pivot_enu_m=mirrors.pivot,
+        start_rot_enu_from_mirror=mirrors.rot,
         reflectors=reflectors,
-        calibration_enu_m=scenario.calibration_enu_m,
-        calibration_share=calibration_share(stages.tones.sigma_rad, scenario),
+        calibration_enu_m=mirrors.calibration,
         tone_count=len(scenario.tone),
-        knowledge=known,
+        knowledge=mirrors.known,
         free_space=scenario.reflection.spreading == "free_space",
         start_sigma_m=_START_SIGMA_M,
         propagation_speed_mps=scenario.radio.propagation_speed_mps,
