@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_file import read_result, write_result
 from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.simulate import simulate_recording
-from rfpose.pipeline.solve import check_solvable
+from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -125,6 +126,37 @@ def test_a_given_coefficient_is_used_as_given(two_ray: Path, tmp_path: Path, fre
     assert evaluate(result).normal_error_mrad.rms <= 1.3 * free_rms
     assert result.reflection is not None
     assert np.all(result.reflection.coefficient_sigma == 0.0)
+
+
+@pytest.fixture(scope="module")
+def far_apart(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """Three calibration receivers with reflections of their own, in three frames."""
+    data = site(KNOWN, {"ground": {"coefficient": COEFFICIENT}, "frame_count": 3}).model_dump(exclude_none=True)
+    one = data["calibration_receiver"][0]
+    places = ([15.0, -20.0, 2.5], [-45.0, 35.0, 8.0], [35.0, 60.0, 8.0])
+    data["calibration_receiver"] = [one | {"id": f"C{k}", "position_enu_m": place} for k, place in enumerate(places)]
+    path = recorded(Scenario.model_validate(data), tmp_path_factory.mktemp("far"), "far")
+    return process(path, path.with_name("r.h5"), estimator="correlator", reflection="estimate")
+
+
+@pytest.mark.parametrize("model", ["estimate", "known"])
+@pytest.mark.parametrize("lost", ["nothing", "phases"])
+def test_calibration_receivers_each_have_a_reflection_of_their_own(far_apart: Result, model: str, lost: str) -> None:
+    scenario, tones = far_apart.scenario, far_apart.tones
+    if model == "known":
+        table = {"reflection": {"model": "known", "coefficient": COEFFICIENT}}
+        scenario = Scenario.model_validate(scenario.model_dump(exclude_none=True) | table)
+    if lost == "phases":
+        # a frame whose average is of two, a transmitter seen by one, and one that another frame must stand in for
+        phase = np.array(tones.phase_rad)
+        phase[0, -1], phase[1, -2:, 3], phase[2, -3:, 5] = np.nan, np.nan, np.nan
+        tones = replace(tones, phase_rad=phase)
+    result = solve(tones, scenario, settings=far_apart.settings | {"reflection": model}, truth=far_apart.truth)
+    found = evaluate(result)
+    assert found.failed == 0
+    # two angles a pose, twelve poses: 4.5 sigma
+    assert found.ratio_to_bound < 1.0 + 4.5 / np.sqrt(4.0 * 12)
+    assert found.sigma_mrad == pytest.approx(found.bound_mrad, rel=0.1)
 
 
 # -- bad transmitters ----------------------------------------------------------------------------------------

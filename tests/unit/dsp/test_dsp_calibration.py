@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rfpose.dsp.calibration import CalibrationStatus, electronic_phase, interpolate_phase, wrap
+from rfpose.dsp.calibration import CalibrationStatus, average_phases, electronic_phase, interpolate_phase, wrap
 from rfpose.errors import InvalidInputError
 
 TRANSMITTER = np.random.default_rng(0).uniform(-100, 100, (6, 3))
@@ -69,6 +69,59 @@ def test_a_transmitter_seen_by_one_receiver_only_joins_in():
     np.testing.assert_allclose(wrap(relative(found) - relative(electronic))[:, :5], 0.0, atol=1e-9)
     assert sigma[0, 4, 0] == pytest.approx(0.01)
     assert np.isnan(found[:, 5]).all()
+
+
+def shifted(place, electronic, clock, shift):
+    """Phases that lag by reflections, as `average_phases` takes them."""
+    phase = wrap(measured(place, electronic, clock) - shift)
+    sigma = np.broadcast_to([0.01, 0.02, 0.015, 0.01], (len(phase), 6, 2, 4)).transpose(0, 3, 1, 2)
+    return average_phases(phase, sigma, calibration_enu_m=place, transmitter_enu_m=TRANSMITTER, wavelength_m=WAVELENGTH)
+
+
+def test_an_average_follows_its_receivers_however_far():
+    rng = np.random.default_rng(7)
+    place = rng.uniform(-50, 50, (4, 3))
+    electronic = rng.uniform(-np.pi, np.pi, (6, 2))
+    shift = rng.uniform(-1.4, 1.4, (4, 6, 2))
+    average = shifted(place, electronic, rng.uniform(-3, 3, (5, 4, 1, 2)), shift)
+    assert np.abs(wrap(relative(average.phase_rad) - relative(electronic))).max() > 0.3
+    change = average.change_rad(np.stack([shift, shift / 2.0], axis=-1), np.array([3, 0]))
+    # with each receiver's own shift taken off nothing of it is left
+    corrected = average.phase_rad[[3, 0]] + change[..., 0]
+    np.testing.assert_allclose(wrap(relative(corrected) - relative(electronic)), 0.0, atol=1e-9)
+    # derivatives are those of the average of small changes
+    small = average.change_rad(1e-6 * shift[..., None], np.array([3, 0]))[..., 0]
+    np.testing.assert_allclose(relative(change[..., 1]), relative(small) / 2e-6, atol=1e-6)
+
+
+def test_a_mean_of_phases_is_no_phase_of_a_mean():
+    place = np.zeros((2, 3))
+    shift = np.zeros((2, 6, 2))
+    shift[:, 0, 0] = 0.0, 1.2
+    shift[:, 1, 0] = 0.0, -1.2
+    phase = wrap(measured(place, np.zeros((6, 2)), 0.0) + shift)
+    sigma = np.broadcast_to(np.array([0.01, 0.02])[:, None, None], (1, 2, 6, 2))
+    found, _ = electronic_phase(
+        phase, sigma, calibration_enu_m=place, transmitter_enu_m=TRANSMITTER, wavelength_m=WAVELENGTH
+    )
+    # a fifth of the weight is the second one's; as phasors the two would make 0.196 of it
+    np.testing.assert_allclose(wrap(found[0, 0, 0] - found[0, 2, 0]), 0.24, atol=1e-9)
+
+
+def test_receivers_join_in_whatever_their_order():
+    rng = np.random.default_rng(8)
+    place = rng.uniform(-50, 50, (3, 3))
+    electronic = rng.uniform(-np.pi, np.pi, (6, 2))
+    phase = measured(place, electronic, rng.uniform(-3, 3, (1, 3, 1, 2)))
+    # the first two share no transmitter; the last one joins them
+    phase[:, 0, 2:], phase[:, 1, :3], phase[:, 2, [0, 5]] = np.nan, np.nan, np.nan
+    settings = {"calibration_enu_m": place, "transmitter_enu_m": TRANSMITTER, "wavelength_m": WAVELENGTH}
+    found, _ = electronic_phase(phase, np.full(phase.shape, 0.01), **settings)
+    np.testing.assert_allclose(wrap(relative(found) - relative(electronic)), 0.0, atol=1e-9)
+    phase[:, 2] = np.nan
+    found, sigma = electronic_phase(phase, np.full(phase.shape, 0.01), **settings)
+    np.testing.assert_array_equal(np.isfinite(found[0, :, 0]), [False, False, False, True, True, True])
+    np.testing.assert_array_equal(np.isfinite(sigma), np.isfinite(found))
 
 
 def test_survey_error_enters_the_sigma():
