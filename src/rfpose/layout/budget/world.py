@@ -1,6 +1,6 @@
 """A world with errors in it: what receivers then measure, and what the solver makes of it.
 
-Ranges are exact distances, not linear ones; calibration goes through `rfpose.dsp.calibration.electronic_phase`, poses
+Ranges are exact distances, not linear ones; calibration goes through `rfpose.dsp.calibration.average_phases`, poses
 through `solve_rigid`, `solve_with_ground` or `solve_poses`. Whole wavelengths count as resolved.
 """
 
@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.dsp.calibration import electronic_phase
+from rfpose.dsp.calibration import PhaseAverage, average_phases
 from rfpose.layout.budget.plan import Plan
 from rfpose.multilat import range_differences, solve_poses
-from rfpose.multilat.ground import solve_with_ground
+from rfpose.multilat.ground import CalibrationSight, solve_with_ground
 from rfpose.multilat.rigid import solve_rigid
 from rfpose.multilat.rigid.integers import Observation
 
@@ -69,6 +69,7 @@ class World:
         self.glass_tilt_rad = np.zeros((n_draw, n_mirror, 2))
         self.turn_rate_rad_per_s = np.zeros((n_draw, n_mirror, 2))
         self.latency_s = 0.0
+        self._average: PhaseAverage | None = None
         self.with_ground = plan.reflects
         ground = scenario.simulation.ground
         self.coefficient = np.full(n_draw, 0j if ground is None else complex(*ground.coefficient))
@@ -168,7 +169,7 @@ class World:
             return range_m
         per_m = 2.0 * np.pi / plan.wavelength_m[: plan.n_tone, 0]
         found = self._calibration_ranges()
-        phase, _ = electronic_phase(
+        self._average = average_phases(
             np.moveaxis(-found * per_m[:, None], 2, 3),
             np.broadcast_to(np.moveaxis(plan.calibration_thermal_m * per_m[:, None], 1, 2), found.swapaxes(2, 3).shape)
             * np.sqrt(1.0 + plan.converter_share),
@@ -177,7 +178,7 @@ class World:
             wavelength_m=plan.wavelength_m[: plan.n_tone, 0],
             survey_sigma_m=plan.survey_sigma_m,
         )
-        electronic = np.moveaxis(phase, 2, 1)[:, None, :, None] / per_m[:, None, None]
+        electronic = np.moveaxis(self._average.phase_rad, 2, 1)[:, None, :, None] / per_m[:, None, None]
         out = range_m.copy()
         tones = out[:, :, : plan.n_tone]
         tones += electronic
@@ -217,7 +218,7 @@ class World:
             start_pivot_enu_m=np.tile(plan.mirrors.pivot_enu_m, (n_draw, 1)),
             start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
             reflectors=(plan.reflector(coefficient),),
-            calibration_enu_m=plan.scenario.calibration_enu_m if plan.scenario.calibration_receiver else None,
+            calibration_enu_m=self._calibration_sight(np.repeat(np.arange(self.n_draw)[draws], range_m.shape[1])),
             knowledge=plan.knowledge(self.surveyed_pivot_enu_m[draws].reshape(-1, 3)),
             free_space=plan.scenario.simulation.path_loss == "free_space",
             min_probability=0.0,
@@ -226,6 +227,18 @@ class World:
         resolved: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=1))
         normal = np.where(resolved[:, None], solution.poses.normal_enu, np.nan)
         return normal.reshape(n_draw, -1, 3)
+
+    def _calibration_sight(self, draw: npt.NDArray[np.int64]) -> CalibrationSight | None:
+        """Return how reflections at the calibration receivers get into the ranges of mirrors of these draws."""
+        plan, average = self.plan, self._average
+        if average is None:
+            return None
+        per_m = (2.0 * np.pi / plan.wavelength_m[: plan.n_tone, 0])[:, None]
+        return CalibrationSight(
+            place_enu_m=plan.scenario.calibration_enu_m,
+            frame=draw,
+            change_m=lambda shift_m, draws: average.change_rad(per_m * shift_m, draws) / per_m,
+        )
 
     def _solve_independent(self, range_m: FloatArray) -> FloatArray:
         plan, scenario = self.plan, self.plan.scenario
