@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Literal
@@ -15,7 +16,10 @@ from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat import _kernels
 
-__all__ = ["FixStatus", "Fixes", "locate"]
+__all__ = ["FixStatus", "Fixes", "Side", "locate"]
+
+Side = Literal["below", "above"] | None
+"""Of the transmitters' plane."""
 
 IntArray = npt.NDArray[np.int16]
 StatusArray = npt.NDArray[np.int8]
@@ -26,8 +30,20 @@ STEP_TOLERANCE_SIGMA = 1e-6
 RESTART_PROBABILITY = 1e-3
 # Part of each Gauss-Newton step taken then: slower, but it converges where full steps swing to and fro.
 RESTART_RELAX = 0.5
-# A solution on the side where receivers are known to be is taken unless its residuals are less likely than this.
+# A solution on the side where receivers are known to be is taken unless its residuals are less likely than this, or
+# less likely than the other side's by this factor.
 SIDE_PROBABILITY = 1e-6
+# Of two solutions on either side of the transmitters' plane the better one counts where its chi-squared is smaller by
+# this much: the other is then less likely than a ten-thousandth of it.
+DECISIVE_CHI2 = 2.0 * np.log(1e4)
+# Solutions nearer to each other than this many standard deviations are one.
+APART_SIGMA = 3.0
+# How much less than at the mirror image itself chi-squared may be where a solution is found nearby: by how far that
+# lies above what decides, a row needs no second start.
+IMAGE_MARGIN = 1e4
+# A fix whose position RMS exceeds this part of the transmitters' extent (RMS about their centroid) is not solved:
+# what is known of it is no straight line any more, and its covariance says little.
+MAX_SIGMA_OF_EXTENT = 0.25
 
 
 class FixStatus(IntEnum):
@@ -41,6 +57,8 @@ class FixStatus(IntEnum):
     WEAK_GEOMETRY = 5
     RESIDUAL = 6
     UNCALIBRATED = 7
+    AMBIGUOUS = 8
+    UNCERTAIN = 9
 
     @property
     def reason(self) -> str:
@@ -56,6 +74,9 @@ _REASON = {
     FixStatus.NOT_CONVERGED: "the iteration did not converge from any start",
     FixStatus.WEAK_GEOMETRY: "dilution of precision above the limit",
     FixStatus.UNCALIBRATED: "no calibration receiver: ranges are not known, only differences between receivers",
+    FixStatus.AMBIGUOUS: "two places, mirrored in the transmitters' plane, fit alike; transmitters of unequal "
+    "heights or a known side would tell",
+    FixStatus.UNCERTAIN: "known to no better than a quarter of the transmitters' extent",
     FixStatus.RESIDUAL: "residuals far above what the sigma of the ranges allows (a reflection, a blocked path?)",
 }
 
@@ -64,9 +85,9 @@ _REASON = {
 class Fixes:
     """Positions of receivers, one row a receiver, in the site ENU frame; arrays are read-only.
 
-    A row whose status is neither OK nor RESIDUAL is NaN. A RESIDUAL row keeps its numbers, as the best that
-    least squares can say; its covariance is not to be trusted. ``xyz`` is ``xy`` where two dimensions were
-    solved.
+    A row keeps its numbers where its status is OK, RESIDUAL (the best that least squares can say; its covariance is
+    not to be trusted), AMBIGUOUS (one of two places) or UNCERTAIN; else it is NaN. ``xyz`` is ``xy`` where two
+    dimensions were solved.
 
     Attributes
     ----------
@@ -115,7 +136,7 @@ def locate(
     sigma_m: npt.ArrayLike | float,
     start_enu_m: npt.ArrayLike | None = None,
     max_dop: float = 100.0,
-    side: Literal["below", "above"] | None = "below",
+    side: Side | Sequence[Side] = "below",
     max_iteration: int = 30,
     min_probability: float = 1e-9,
 ) -> Fixes:
@@ -139,9 +160,12 @@ def locate(
     max_dop
         A larger dilution of precision makes a row WEAK_GEOMETRY.
     side
-        Transmitters of similar height have a second solution near the mirror image in their plane, which noise can
-        make the better one. The solution on this side of the plane is taken where it is likely too. None: least
-        squares alone decides. Without effect in two dimensions or with a given start.
+        On which side of the transmitters' plane receivers are KNOWN to be; one for all or one a receiver. Transmitters
+        of similar height have a second solution near the mirror image in their plane, which noise can make the better
+        one. The solution on the known side is taken unless it is a million times less likely than noise or the other
+        side would have it; of two there, the better one. None: nothing is known, and the better one counts; where
+        neither wins (`DECISIVE_CHI2`) it is the lower one and the row is AMBIGUOUS. In two dimensions, where that
+        means a line, nothing is known. Without effect with a given start.
     max_iteration
         Gauss-Newton steps before a row is given up (twice as many, half as long, from other starts).
     min_probability
@@ -172,8 +196,7 @@ def locate(
     max_dop = _positive_or_inf("max_dop", max_dop)
     if not 1 <= max_iteration <= 10_000:
         raise InvalidInputError(f"`max_iteration` must lie between 1 and 10000, got {max_iteration}")
-    if side not in ("below", "above", None):
-        raise InvalidInputError(f"`side` must be 'below', 'above' or None, got {side!r}")
+    known = _known_side(side, len(ranges), n_axis)
     if not 0.0 <= min_probability < 1.0:
         raise InvalidInputError(f"`min_probability` must lie in [0, 1), got {min_probability}")
     centre = np.zeros(3)
@@ -187,11 +210,11 @@ def locate(
             raise InvalidInputError(f"`start_enu_m` must have shape ({n_axis},) or (receiver, {n_axis})")
     problem = _Problem(transmitter, centre, scale, max_iteration)
     result = problem.solve(ranges, weight, start)
+    ambiguous = np.zeros(len(ranges), np.bool_)
     if start is None:
         _restart(problem, ranges, weight, result)
-        if side is not None and n_axis == 3:
-            _take_side(problem, ranges, weight, result, 1.0 if side == "above" else -1.0)
-    _judge(result, n_axis, max_dop, min_probability)
+        ambiguous = _choose_side(problem, ranges, weight, result, known)
+    _judge(result, problem, max_dop, min_probability, ambiguous)
     return Fixes(**{name: read_only(array) for name, array in result.items()})
 
 
@@ -220,6 +243,19 @@ def check_transmitters(transmitter_enu_m: npt.ArrayLike) -> FloatArray:
     if singular[1] <= 1e-9 * singular[0]:
         raise GeometryError("`transmitter_enu_m` must not lie on one line: a line fixes no position; move some aside")
     return array
+
+
+def _known_side(side: Side | Sequence[Side], n_receiver: int, n_axis: int) -> FloatArray:
+    """(receiver,) sign of the height above the transmitters' plane, 0 unknown."""
+    sides = [side] if side is None or isinstance(side, str) else list(side)
+    signs = {"below": -1.0, "above": 1.0, None: 0.0}
+    for one in sides:
+        if one not in signs:
+            raise InvalidInputError(f"`side` must be 'below', 'above' or None, got {one!r}")
+    if len(sides) not in (1, n_receiver):
+        raise InvalidInputError(f"`side` must be one for all or one a receiver ({n_receiver}), got {len(sides)}")
+    known = np.array([signs[one] for one in sides])
+    return np.array(np.broadcast_to(known if n_axis == 3 else np.zeros(1), (n_receiver,)))
 
 
 def _positive_or_inf(name: str, value: float) -> float:
@@ -328,22 +364,105 @@ def _restart(problem: _Problem, ranges: FloatArray, weight: FloatArray, result: 
             result[name][rows[better]] = array[better]
 
 
-def _take_side(
-    problem: _Problem, ranges: FloatArray, weight: FloatArray, result: dict[str, npt.NDArray[Any]], sign: float
-) -> None:
-    """Look for a likely solution on the wanted side of the transmitters' plane for rows that lie on the other."""
-    rows = np.flatnonzero((result["status"] == FixStatus.OK) & (sign * problem.height(result["position_enu_m"]) < 0.0))
+def _choose_side(
+    problem: _Problem,
+    ranges: FloatArray,
+    weight: FloatArray,
+    result: dict[str, npt.NDArray[Any]],
+    known: FloatArray,
+) -> npt.NDArray[np.bool_]:
+    """Look for each row's solution on the other side of its transmitters' plane, and take the right one.
+
+    ``known`` (receiver,) is the sign of the height above the plane of all transmitters, 0 unknown. Returns which rows
+    have two solutions that fit alike.
+    """
+    ambiguous = np.zeros(len(ranges), np.bool_)
+    solved = np.flatnonzero(result["status"] == FixStatus.OK)
+    if not solved.size:
+        return ambiguous
+    place = result["position_enu_m"]
+    image = np.full(place.shape, np.nan)
+    seen = np.isfinite(result["residual_m"])
+    for pattern, rows in _patterns(seen, solved):
+        at = rows[_has_image(problem.transmitter[pattern], place[rows], _rows_of(weight, rows)[:, pattern])]
+        image[at] = _Plane.of(problem.transmitter[pattern]).mirrored(place[at])
+    wrong = solved[known[solved] * problem.height(place[solved]) < 0.0]
+    wrong = wrong[np.isnan(image[wrong, 0])]
+    image[wrong] = problem.mirrored(place[wrong])
+    rows = np.flatnonzero(np.isfinite(image[:, 0]))
     if not rows.size:
-        return
-    row_weight = weight if len(weight) == 1 else weight[rows]
-    start = problem.mirrored(result["position_enu_m"][rows])
-    again = problem.solve(ranges[rows], row_weight, start, relax=RESTART_RELAX)
-    limit = _chi2_limit(again["n_transmitter"], 3, SIDE_PROBABILITY)
+        return ambiguous
+    again = problem.solve(ranges[rows], _rows_of(weight, rows), image[rows], relax=RESTART_RELAX)
+    here, there = place[rows], again["position_enu_m"]
+    apart = here - there
     with np.errstate(invalid="ignore"):
-        better = (again["status"] == FixStatus.OK) & (sign * problem.height(again["position_enu_m"]) > 0.0)
-        better &= (again["chi2"] <= limit) | (again["chi2"] <= result["chi2"][rows])
+        far = np.einsum("na,nab,nb->n", apart, np.linalg.pinv(result["cov_enu_m2"][rows], hermitian=True), apart)
+        other = (again["status"] == FixStatus.OK) & (far > APART_SIGMA**2)
+        gain = result["chi2"][rows] - again["chi2"]
+        limit = _chi2_limit(again["n_transmitter"], place.shape[1], SIDE_PROBABILITY)
+        sign = known[rows]
+        right, other_right = (sign * problem.height(p) >= 0.0 for p in (here, there))
+        alike = (np.abs(gain) <= DECISIVE_CHI2) & (sign == 0.0)
+        lower = there[:, -1] < here[:, -1] if place.shape[1] == 3 else gain > 0.0
+    both = right == other_right
+    sure = -2.0 * np.log(SIDE_PROBABILITY)
+    likely = ((again["chi2"] <= limit) & (gain > -sure)) | (gain > 0.0)
+    better = other & np.where(both, np.where(alike, lower, gain > 0.0), np.where(right, gain > sure, likely))
+    ambiguous[rows] = other & both & alike
     for name, array in again.items():
         result[name][rows[better]] = array[better]
+    return ambiguous
+
+
+def _rows_of(weight: FloatArray, rows: npt.NDArray[np.intp]) -> FloatArray:
+    """Weights of some rows; one row stands for all."""
+    return weight if len(weight) == 1 else weight[rows]
+
+
+def _patterns(
+    seen: npt.NDArray[np.bool_], rows: npt.NDArray[np.intp]
+) -> Iterator[tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]]:
+    """Sort rows by which transmitters they received."""
+    if seen[rows].all():
+        yield seen[rows[0]], rows
+        return
+    patterns, pattern = np.unique(seen[rows], axis=0, return_inverse=True)
+    for k, received in enumerate(patterns):
+        yield received, rows[pattern.reshape(-1) == k]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plane:
+    """The plane that fits transmitters best; in two dimensions the line."""
+
+    point: FloatArray
+    normal: FloatArray
+
+    @classmethod
+    def of(cls, transmitter: FloatArray) -> _Plane:
+        middle = transmitter.mean(axis=0)
+        return cls(middle, np.linalg.svd(transmitter - middle, full_matrices=True)[2][-1])
+
+    def height(self, place: FloatArray) -> FloatArray:
+        return np.asarray((place - self.point) @ self.normal)
+
+    def mirrored(self, place: FloatArray) -> FloatArray:
+        return np.asarray(place - 2.0 * self.height(place)[:, None] * self.normal)
+
+
+def _has_image(transmitter: FloatArray, place: FloatArray, weight: FloatArray) -> npt.NDArray[np.bool_]:
+    """Tell which rows could have a second solution beyond the transmitters' plane.
+
+    A transmitter δ off the plane, d away, is 2hδ/d farther from or nearer to the image of a place at height h. Where
+    the sum of squares of that, in standard deviations, is beyond all that could decide, there is no need to look.
+    """
+    plane = _Plane.of(transmitter)
+    off = plane.height(transmitter)
+    reach = np.linalg.norm(place - plane.point, axis=1) + np.linalg.norm(transmitter - plane.point, axis=1).max()
+    # weights are in units of the transmitters' extent, as the lengths here are relative
+    relative = weight @ off**2 if len(weight) > 1 else np.full(1, float(weight[0] @ off**2))
+    sum_of_squares = (2.0 * plane.height(place) / reach) ** 2 * relative
+    return np.asarray(sum_of_squares < IMAGE_MARGIN * DECISIVE_CHI2)
 
 
 def _chi2_limit(n_transmitter: IntArray, n_axis: int, probability: float) -> FloatArray:
@@ -352,13 +471,22 @@ def _chi2_limit(n_transmitter: IntArray, n_axis: int, probability: float) -> Flo
     return np.asarray(np.take(chdtri(np.maximum(dof, 1), probability), n_transmitter), np.float64)
 
 
-def _judge(result: dict[str, npt.NDArray[Any]], n_axis: int, max_dop: float, min_probability: float) -> None:
-    """Mark solved rows whose geometry is weak (and blank them) or whose residuals are unlikely."""
+def _judge(
+    result: dict[str, npt.NDArray[Any]],
+    problem: _Problem,
+    max_dop: float,
+    min_probability: float,
+    ambiguous: npt.NDArray[np.bool_],
+) -> None:
+    """Mark solved rows whose geometry is weak (and blank them), and those not to be relied on."""
     status = result["status"]
     weak = (status == FixStatus.OK) & (result["dop"] > max_dop)
     status[weak] = FixStatus.WEAK_GEOMETRY
     for name in ("position_enu_m", "clock_m", "cov_enu_m2", "residual_m", "chi2"):
         result[name][weak] = np.nan
     if min_probability > 0.0:
-        limit = _chi2_limit(result["n_transmitter"], n_axis, min_probability)
+        limit = _chi2_limit(result["n_transmitter"], result["position_enu_m"].shape[1], min_probability)
         status[(status == FixStatus.OK) & (result["chi2"] > limit)] = FixStatus.RESIDUAL
+    variance = np.trace(result["cov_enu_m2"], axis1=1, axis2=2)
+    status[(status == FixStatus.OK) & (variance > (MAX_SIGMA_OF_EXTENT * problem.scale) ** 2)] = FixStatus.UNCERTAIN
+    status[(status == FixStatus.OK) & ambiguous] = FixStatus.AMBIGUOUS

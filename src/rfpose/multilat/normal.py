@@ -11,14 +11,16 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.geometry import azimuth_elevation_from_enu
+from rfpose.geometry import azimuth_elevation_from_enu, is_collinear
 from rfpose.multilat import _kernels
-from rfpose.multilat.fix import Fixes, FixStatus, check_transmitters, locate
+from rfpose.multilat.fix import Fixes, FixStatus, Side, check_transmitters, locate
 
 __all__ = ["Normals", "PoseStatus", "Poses", "joint_covariance", "mirror_normal", "solve_poses"]
 
 # Receivers whose spread across their line is below this part of the spread along it fix no normal.
 COLLINEAR = 1e-3
+# A normal whose RMS angle exceeds this is not solved: so far off, a straight line's covariance says little of it [rad].
+MAX_SIGMA_RAD = 0.1
 
 
 class PoseStatus(IntEnum):
@@ -33,6 +35,8 @@ class PoseStatus(IntEnum):
     UNEXPLAINED = 6
     BEHIND_REFLECTOR = 7
     UNKNOWNS = 8
+    UNCERTAIN = 9
+    AMBIGUOUS = 10
 
     @property
     def reason(self) -> str:
@@ -50,6 +54,10 @@ _REASON = {
     PoseStatus.UNEXPLAINED: "solved, but residuals are larger than noise and a few bad transmitters explain: "
     "a reflection that is not in the model?",
     PoseStatus.BEHIND_REFLECTOR: "a receiver lies behind a reflecting plane (below the ground)",
+    PoseStatus.UNCERTAIN: "the normal is known to no better than 0.1 rad; a better signal, receivers farther apart or "
+    "known delays would help",
+    PoseStatus.AMBIGUOUS: "two poses fit alike, mirrored in the transmitters' plane; transmitters of unequal heights "
+    "or a surveyed pivot would tell",
     PoseStatus.UNKNOWNS: "fewer measurements than unknowns: more transmitters received, a surveyed pivot, a mount or "
     "known delays would help",
 }
@@ -57,7 +65,7 @@ _REASON = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Normals:
-    """Mirror normals; arrays are read-only. A row whose status is neither OK nor RESIDUAL is NaN.
+    """Mirror normals; arrays are read-only. A row is NaN unless its status is OK, RESIDUAL, UNCERTAIN or AMBIGUOUS.
 
     Attributes
     ----------
@@ -141,6 +149,7 @@ def mirror_normal(
     Returns
     -------
     Normals
+        A normal of `MAX_SIGMA_RAD` or more is UNCERTAIN; receivers on a line, as placed or as located, are COLLINEAR.
 
     Raises
     ------
@@ -181,11 +190,13 @@ def mirror_normal(
         places = None if mirror is None else mirror[index]
         vector[rows], vector_cov[rows], flat = _plane(position[rows][:, index], cov[rows][:, xyz[:, None], xyz], places)
         status[rows] = np.where(flat, PoseStatus.COLLINEAR, PoseStatus.OK)
+    sigma = np.sqrt(np.trace(vector_cov, axis1=1, axis2=2))
+    status[(status == PoseStatus.OK) & ~(sigma <= MAX_SIGMA_RAD)] = PoseStatus.UNCERTAIN
     azimuth, elevation = azimuth_elevation_from_enu(vector)
     result = {
         "normal_enu": vector,
         "cov_enu": vector_cov,
-        "sigma_rad": np.sqrt(np.trace(vector_cov, axis1=1, axis2=2)),
+        "sigma_rad": sigma,
         "azimuth_rad": azimuth,
         "elevation_rad": elevation,
         "n_receiver": used.sum(axis=1).astype(np.int16),
@@ -202,6 +213,9 @@ def _plane(
     scatter = np.einsum("nkx,nky->nxy", centred, centred)
     size, axes = np.linalg.eigh(np.where(np.isfinite(scatter), scatter, 0.0))
     flat = ~(size[:, 1] > COLLINEAR**2 * size[:, 2])
+    if mirror is not None and is_collinear(mirror, tolerance=COLLINEAR):
+        # located with noise, receivers on a line do not look like it
+        flat[:] = True
     with np.errstate(invalid="ignore", divide="ignore"):
         if mirror is not None:
             normal, jacobian = _cross_product(centred, *_affine_rows(mirror))
@@ -329,6 +343,7 @@ def solve_poses(
     calibration_sigma_m: npt.ArrayLike | float = 0.0,
     mirror_rows: Sequence[slice | Sequence[int]],
     receiver_mirror_m: Sequence[npt.ArrayLike] | None = None,
+    side: Sequence[Side] | Side = "below",
     max_dop: float = 100.0,
     min_probability: float = 1e-9,
 ) -> Poses:
@@ -348,6 +363,8 @@ def solve_poses(
         For each mirror, which rows of the receiver axis are its receivers, numbered counter-clockwise.
     receiver_mirror_m
         For each mirror, (receiver, xyz) places in the mirror frame [m]; see `mirror_normal`.
+    side
+        As in `locate`; one for all or one a row of the receiver axis.
     max_dop, min_probability
         See `locate`.
 
@@ -378,6 +395,7 @@ def solve_poses(
         transmitter,
         ranges.reshape(-1, n_transmitter),
         sigma_m=np.hypot(own, common).reshape(-1, n_transmitter),
+        side=side if side is None or isinstance(side, str) else list(side) * n_frame,
         max_dop=max_dop,
         min_probability=min_probability,
     )
@@ -399,12 +417,16 @@ def solve_poses(
         index = np.array([rows_of[m] for m in mirrors])
         cov = joint_covariance(transmitter, position[:, index], own[:, index], common[:, index])
         normals = mirror_normal(position[:, index], cov, receiver_mirror_m=places)
-        doubtful = (fix_status[:, index] == FixStatus.RESIDUAL).any(axis=2)
+        doubts = {
+            PoseStatus.AMBIGUOUS: (fix_status[:, index] == FixStatus.AMBIGUOUS).any(axis=2),
+            PoseStatus.RESIDUAL: (fix_status[:, index] == FixStatus.RESIDUAL).any(axis=2),
+        }
         for name, array in out.items():
             array[:, mirrors] = getattr(normals, name)
-        out["status"][:, mirrors] = np.where(
-            doubtful & (normals.status == PoseStatus.OK), PoseStatus.RESIDUAL, normals.status
-        )
+        status = np.array(normals.status)
+        for doubt, doubtful in doubts.items():
+            status[doubtful & (normals.status == PoseStatus.OK)] = doubt
+        out["status"][:, mirrors] = status
         located = np.isfinite(position[:, index])
         with np.errstate(invalid="ignore", divide="ignore"):
             centre[:, mirrors] = np.where(located, position[:, index], 0.0).sum(axis=2) / located.sum(axis=2)

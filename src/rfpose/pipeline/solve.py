@@ -22,7 +22,7 @@ from rfpose.multilat import (
     range_differences,
     solve_poses,
 )
-from rfpose.multilat.fix import check_transmitters
+from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.result import FixTable, PoseTable, Result
@@ -31,6 +31,12 @@ from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
 __all__ = ["POSES", "check_solvable", "solve"]
+
+_UNSURVEYED_M = 3.0
+"""How far a pivot may be from where the scenario has it, if it is not surveyed."""
+
+_SURVEY_SIGMAS = 6.0
+"""How many standard deviations a surveyed place may be off."""
 
 
 def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None = None) -> None:
@@ -129,6 +135,7 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         calibration_sigma_m=ranges.calibration_sigma_m,
         mirror_rows=[scenario.receiver_rows(i) for i in range(len(scenario.heliostat))],
         receiver_mirror_m=[heliostat.receiver_mirror_m for heliostat in scenario.heliostat],
+        side=_sides(scenario),
     )
     n_frame, n_receiver = tones.phase_rad.shape[:2]
     fixes = _fix_table(poses.fixes, n_frame, n_receiver)
@@ -162,6 +169,28 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         filtered=None if rigid is None else rigid.filtered,
         truth=truth,
     )
+
+
+def _sides(scenario: Scenario) -> list[Side]:
+    """Return on which side of the transmitters' plane each receiver is known to be: as far as its mirror can reach."""
+    middle = scenario.transmitter_enu_m.mean(axis=0)
+    up = np.linalg.svd(scenario.transmitter_enu_m - middle)[2][-1]
+    up = up if up[2] >= 0.0 else -up
+    out: list[Side] = []
+    for receiver in scenario.receivers:
+        if receiver.heliostat is None:
+            assert receiver.calibration is not None
+            kept = scenario.calibration_receiver[receiver.calibration]
+            place, reach = np.array(kept.position_enu_m), _SURVEY_SIGMAS * kept.survey_sigma_m
+        else:
+            mirror = scenario.heliostat[receiver.heliostat]
+            place = np.array(mirror.pivot_enu_m)
+            off = _UNSURVEYED_M if mirror.pivot_sigma_m is None else _SURVEY_SIGMAS * mirror.pivot_sigma_m
+            width = np.linalg.norm(np.array(mirror.receiver_mirror_m), axis=1).max()
+            reach = float(width) + mirror.arm_m + off
+        height = float((place - middle) @ up)
+        out.append(None if abs(height) <= reach else "above" if height > 0.0 else "below")
+    return out
 
 
 def _received(tones: TonePhases) -> npt.NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.result import FixTable, PoseTable
 from rfpose.pipeline.rigid.direct import solve_direct
-from rfpose.pipeline.rigid.found import Stages
+from rfpose.pipeline.rigid.found import Stages, without_vague
 from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
 from rfpose.pipeline.rigid.two_ray import solve_two_ray
 from rfpose.scenario import Scenario
@@ -55,6 +55,7 @@ def solve_rigid_poses(
     time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
     for group in mirror_groups(scenario):
         found = solve_two_ray(stages, group) if choice.reflection != "none" else solve_direct(stages, group)
+        found = without_vague(found)
         if group.learns_delays:
             found = tables.put_delays(group, found, time_s)
         tables.put(group, found)

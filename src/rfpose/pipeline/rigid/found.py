@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.multilat import PoseStatus, RangeDifferences
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
+from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus
 from rfpose.multilat.rigid.integers import Observation
 from rfpose.pipeline.choice import PoseChoice
@@ -75,6 +77,12 @@ def residual_probability(poses: RigidPoses) -> FloatArray:
         return np.asarray(chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)))
 
 
+def without_vague(found: Found) -> Found:
+    """Mark poses that tell less of the normal than would make them solved."""
+    vague = ~(found.poses.tilt_sigma_rad <= MAX_SIGMA_RAD)
+    return replace(found, status=np.where((found.status == PoseStatus.OK) & vague, PoseStatus.UNCERTAIN, found.status))
+
+
 def are_doubted(guard: GuardedPoses) -> BoolArray:
     """(mirror,) not explained, or explained by leaving out so much that nothing confirms it."""
     left_out = (guard.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) | guard.prior_rejected.any(
@@ -97,6 +105,25 @@ def rows_of(phases: Observation, rows: IntArray) -> Observation:
         sigma_m=phases.sigma_m[rows],
         transmitter_sigma_m=phases.transmitter_sigma_m[rows],
     )
+
+
+def put_rows(first: Found, rows: IntArray, second: Found, those: IntArray) -> Found:
+    """Return poses with some mirrors' replaced by those of another solution."""
+    return cast("Found", _put(first, rows, second, those))
+
+
+def _put(first: Any, rows: IntArray, second: Any, those: IntArray) -> Any:
+    if first is None:
+        return None
+    if isinstance(first, list):
+        return [_put(a, rows, b, those) for a, b in zip(first, second, strict=True)]
+    if is_dataclass(first) and not isinstance(first, type):
+        by_mirror = [f.name for f in fields(first) if f.name not in ("known", "wavelength_m", "clock_class")]
+        values = {name: _put(getattr(first, name), rows, getattr(second, name), those) for name in by_mirror}
+        return replace(first, **values)
+    out = np.array(first)
+    out[rows] = second[those]
+    return out
 
 
 def where_known(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,18 @@ def inputs_of(stages: Stages, group: MirrorGroup) -> tuple[FloatArray, FloatArra
             clock_sigma_m=known.clock_sigma_m,
         )
     return places, start, rot, phases
+
+
+def either_side(stages: Stages, group: MirrorGroup) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Poses to begin with (pivot, rotation), all receivers below the transmitters' plane, then all above it."""
+    middle = stages.scenario.transmitter_enu_m.mean(axis=0)
+    up = np.linalg.svd(stages.scenario.transmitter_enu_m - middle)[2][-1]
+    up = up if up[2] >= 0.0 else -up
+    places = np.tile(group.places_m, (len(stages.tones.frame_start_index), 1, 1))
+    located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
+    height = ((located - middle) @ up)[..., None]
+    for sign in (-1.0, 1.0):
+        yield align_points(places, located + (sign * np.abs(height) - height) * up)
 
 
 def _without_vague_calibration(phases: Observation, known: Knowledge) -> Observation:
