@@ -24,6 +24,7 @@ from rfpose.multilat.integrity.hypotheses import (
     noncentrality,
     quiet_median,
     tilt_quantile,
+    widened,
 )
 from rfpose.multilat.rigid import RigidPoses, RigidStatus
 
@@ -254,8 +255,9 @@ class _Guard:
         ):
             poses[name][changed] = values[changed]
         poses["status"][changed] = RigidStatus.OK
+        guarded = RigidPoses(**{name: read_only(array) for name, array in poses.items()})
         return GuardedPoses(
-            poses=RigidPoses(**{name: read_only(array) for name, array in poses.items()}),
+            poses=widened(guarded, np.asarray(changed), level, self.missed),
             status=read_only(status),
             transmitter_status=read_only(self.transmitter_status),
             used=read_only(np.asarray((self.problem.mirrors.weight > 0.0).any(axis=1))),

@@ -22,6 +22,7 @@ from rfpose.multilat.integrity.hypotheses import (
     noncentrality,
     quiet_median,
     tilt_quantile,
+    widened,
 )
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, solve_rigid
 
@@ -99,7 +100,8 @@ class GuardedPoses:
     Attributes
     ----------
     poses
-        After all exclusions. A pose whose ``status`` here is UNEXPLAINED keeps its numbers; they are not to be trusted.
+        After all exclusions; where there were any, the covariance is as wide as the protection level (`widened`). A
+        pose whose ``status`` here is UNEXPLAINED keeps its numbers; they are not to be trusted.
     status : (mirror,)
         `IntegrityStatus` as int8.
     transmitter_status : (mirror, transmitter)
@@ -590,8 +592,10 @@ class _Guard:
         level[unprotected] = np.inf
         self.status[np.isinf(level) & ~unprotected] = IntegrityStatus.NO_REDUNDANCY
         worst = np.where(ambiguous | unprotected, -1, self.worst)
+        poses = RigidPoses(**{name: read_only(array) for name, array in self.poses.items()})
+        left_out: BoolArray = np.asarray(self._n_left_out(np.arange(len(level))) > 0)
         return GuardedPoses(
-            poses=RigidPoses(**{name: read_only(array) for name, array in self.poses.items()}),
+            poses=widened(poses, left_out, level, self.missed),
             status=read_only(self.status),
             transmitter_status=read_only(self.transmitter_status),
             used=read_only(np.asarray((self.problem.weight > 0.0).any(axis=1))),

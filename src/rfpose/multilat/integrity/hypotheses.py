@@ -7,13 +7,13 @@ equations; without a fault it is chi²-distributed with as many degrees of freed
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri, chndtrinc, gammaincc, gammaln
 
-from rfpose.checks import FloatArray
+from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.integrity import _kernels
 from rfpose.multilat.rigid import Knowledge, RigidPoses
 
@@ -28,6 +28,7 @@ __all__ = [
     "noncentrality",
     "quiet_median",
     "tilt_quantile",
+    "widened",
 ]
 
 IntArray = npt.NDArray[np.int64]
@@ -279,6 +280,32 @@ def largest_eigenvalue(matrix: FloatArray) -> FloatArray:
 def tilt_quantile(probability: float) -> float:
     """How many of its larger sigmas a two-dimensional normal error exceeds with at most ``probability``."""
     return float(np.sqrt(-2.0 * np.log(probability)))
+
+
+def widened(poses: RigidPoses, left_out: BoolArray, level_rad: FloatArray, missed: float) -> RigidPoses:
+    """Return poses whose covariance allows for what their protection levels do, where something was left out.
+
+    Where one transmitter proved wrong, the others are no longer known to be right: the normal's standard deviation,
+    whichever way, is at least that of an error which exceeds the level with probability ``missed``.
+
+    Parameters
+    ----------
+    poses
+    left_out : (mirror,)
+        Where any transmitter or prior was.
+    level_rad : (mirror,)
+        Protection level; where it is infinite nothing is changed.
+    missed
+        Missed-detection probability of the level.
+    """
+    rows = np.flatnonzero(left_out & np.isfinite(level_rad) & np.isfinite(poses.cov).all(axis=(1, 2)))
+    cov = np.array(poses.cov)
+    axes = poses.rot_enu_from_mirror[rows][:, :, :2]
+    size, way = np.linalg.eigh(np.swapaxes(axes, 1, 2) @ cov[rows, 3:, 3:] @ axes)
+    lacking = np.maximum((level_rad[rows, None] / tilt_quantile(missed)) ** 2 - size, 0.0)
+    turn = axes @ way
+    cov[rows, 3:, 3:] += (turn * lacking[:, None]) @ np.swapaxes(turn, 1, 2)
+    return replace(poses, cov=read_only(cov))
 
 
 def quiet_median(x: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.multilat import PoseStatus, RangeDifferences
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity.hypotheses import widened
 from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus
 from rfpose.multilat.rigid.integers import Observation
@@ -77,6 +78,20 @@ def residual_probability(poses: RigidPoses) -> FloatArray:
         return np.asarray(chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)))
 
 
+def as_protected(found: Found, missed: float) -> Found:
+    """Let covariances say what protection levels do, where something was left out; ``missed`` is theirs."""
+    guard = found.guard
+    if guard is None:
+        return found
+    return replace(found, poses=widened(found.poses, _left_out(guard), guard.protection_level_rad, missed))
+
+
+def _left_out(guard: GuardedPoses) -> BoolArray:
+    """(mirror,) whether any transmitter or prior was."""
+    excluded = (guard.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1)
+    return np.asarray(excluded | guard.prior_rejected.any(axis=1))
+
+
 def without_vague(found: Found) -> Found:
     """Mark poses that tell less of the normal than would make them solved."""
     vague = ~(found.poses.tilt_sigma_rad <= MAX_SIGMA_RAD)
@@ -85,10 +100,7 @@ def without_vague(found: Found) -> Found:
 
 def are_doubted(guard: GuardedPoses) -> BoolArray:
     """(mirror,) not explained, or explained by leaving out so much that nothing confirms it."""
-    left_out = (guard.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) | guard.prior_rejected.any(
-        axis=1
-    )
-    unconfirmed = left_out & (guard.status == IntegrityStatus.NO_REDUNDANCY)
+    unconfirmed = _left_out(guard) & (guard.status == IntegrityStatus.NO_REDUNDANCY)
     return np.asarray((guard.status == IntegrityStatus.UNEXPLAINED) | unconfirmed)
 
 
