@@ -33,8 +33,13 @@ def _scenario(change: Callable[[dict[str, Any]], None] = lambda _data: None, **s
     return Scenario.model_validate(data)
 
 
-def _record(path: Path, scenario: Scenario, spoil: Callable[[Chunk], None] = lambda _chunk: None) -> Path:
-    """Write a simulated recording whose samples ``spoil`` may change."""
+def _record(
+    path: Path,
+    scenario: Scenario,
+    spoil: Callable[[Chunk], None] = lambda _chunk: None,
+    late: Callable[[str], int] = lambda _receiver_id: 0,
+) -> Path:
+    """Write a simulated recording whose samples ``spoil`` may change, each receiver ``late`` samples too late."""
     simulator = Simulator(scenario, seed=3)
     writer = RecordingWriter(
         path,
@@ -49,7 +54,7 @@ def _record(path: Path, scenario: Scenario, spoil: Callable[[Chunk], None] = lam
     with writer:
         for chunk in simulator:
             spoil(chunk)
-            writer.write(chunk.receiver_id, chunk.start_index, chunk.samples)
+            writer.write(chunk.receiver_id, chunk.start_index + late(chunk.receiver_id), chunk.samples)
         writer.write_truth(simulator.truth)
     return path
 
@@ -120,6 +125,18 @@ def test_gap_costs_one_mirror_frame(tmp_path: Path, clean: dict[str, Result]) ->
     assert result.poses.status.tolist() == [[0, 0], [0, 0], [0, PoseStatus.TOO_FEW]]
     solved = result.poses.status == PoseStatus.OK
     np.testing.assert_array_equal(result.poses.normal_enu[solved], clean["int16"].poses.normal_enu[solved])
+
+
+def test_bursts_that_start_some_samples_apart_are_measured_each_in_its_own_frame(
+    tmp_path: Path, clean: dict[str, Result]
+) -> None:
+    """A trigger reaches the receivers at different samples; a burst is one frame long, so no frame fits in all."""
+    names = _scenario().receiver_ids
+    late = dict(zip(names, np.random.default_rng(8).integers(0, 50, len(names)).tolist(), strict=True))
+    result = process(_record(tmp_path / "rec.h5", _scenario(), late=lambda name: late[name]), tmp_path / "result.h5")
+    np.testing.assert_array_equal(result.tones.phase_rad, clean["int16"].tones.phase_rad)
+    np.testing.assert_array_equal(result.poses.normal_enu, clean["int16"].poses.normal_enu)
+    assert summarise(result)["poses"]["solved"] == 6
 
 
 def test_too_few_transmitters_cost_the_mirror_that_does_not_see_them(tmp_path: Path) -> None:

@@ -43,6 +43,23 @@ def runs_of(indices):
     return runs
 
 
+def best_offset(blocks, at, count, frame_samples):
+    """The first place for the grid at which the receivers have most whole frames, by trying them all."""
+
+    def n_whole(offset):
+        grid = range(at + offset, at + count - frame_samples + 1, frame_samples)
+        return sum(b <= start and start + frame_samples <= b + n for b, n in blocks for start in grid)
+
+    return max(range(frame_samples), key=lambda offset: (n_whole(offset), -offset))
+
+
+def own_frame(blocks, frame, frame_samples):
+    """The nearest place within a quarter of a frame at which a whole frame was recorded, by trying them all."""
+    slack = frame_samples // 4
+    near = sorted(range(frame - slack, frame + slack + 1), key=lambda k: (abs(k - frame), k))
+    return next((k for k in near if any(b <= k and k + frame_samples <= b + n for b, n in blocks)), None)
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     start=st.integers(0, 2**57),
@@ -76,8 +93,16 @@ def test_any_block_pattern_round_trips(start, first, second, shift, frame_sample
                     assert recording.covers(name, at, 5) == (set(range(at, at + 5)) <= recorded)
             union = runs_of(layout["a"][1] | layout["b"][1])
             assert recorded_runs(recording).tolist() == union
-            expected = [at + k * frame_samples for at, count in union for k in range(count // frame_samples)]
+            blocks = [block for name in layout for block in recording.blocks(name).tolist()]
+            expected = []
+            for at, count in union:
+                offset = best_offset(blocks, at, count, frame_samples)
+                expected += range(at + offset, at + count - frame_samples + 1, frame_samples)
             assert frame_starts(recording, frame_samples).tolist() == expected
+            for name in layout:
+                for frame in expected:
+                    own = recording.frame_at(name, frame, frame_samples)
+                    assert own == own_frame(recording.blocks(name).tolist(), frame, frame_samples)
 
 
 @settings(max_examples=15, deadline=None)

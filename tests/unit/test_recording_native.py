@@ -231,10 +231,41 @@ def test_frames_start_where_any_receiver_starts(tmp_path):
         assert frame_starts(r, 100).dtype == np.int64
 
 
+@pytest.mark.parametrize(
+    ("starts", "count", "grid"),
+    [
+        ((0, 3, 5), 1050, [5 + 100 * k for k in range(10)]),  # the overlap of all three
+        ((0, 3, 3), 100, [3]),  # bursts of one frame: no overlap holds it; where most of them lie
+        ((0, 40, 0), 1000, [100 * k for k in range(10)]),  # one that is late costs the others no frame
+    ],
+)
+def test_frames_are_laid_where_receivers_that_start_apart_have_most(tmp_path, starts, count, grid):
+    path, names = tmp_path / "r.h5", ["a", "b", "c"]
+    with writer(path, receiver_ids=names) as w:
+        for name, start in zip(names, starts, strict=True):
+            w.write(name, EPOCH + start, counts(count))
+    with open_recording(path) as r:
+        assert (frame_starts(r, 100) - EPOCH).tolist() == grid
+
+
+def test_a_receiver_has_its_own_frame_at_most_a_quarter_beside_the_common_one(tmp_path):
+    with writer(tmp_path / "r.h5") as w:
+        w.write("a", EPOCH, counts(100))
+        w.write("b", EPOCH + 7, counts(120))
+    with open_recording(tmp_path / "r.h5") as r:
+        assert r.frame_at("a", EPOCH, 100) == EPOCH
+        assert r.frame_at("a", EPOCH + 25, 100) == EPOCH
+        assert r.frame_at("a", EPOCH + 26, 100) is None
+        assert r.frame_at("b", EPOCH, 100) == EPOCH + 7
+        assert r.frame_at("b", EPOCH + 10, 100) == EPOCH + 10
+        assert r.frame_at("b", EPOCH + 30, 100) == EPOCH + 27
+        assert r.frame_at("b", EPOCH, 121) is None
+
+
 def test_what_is_left_of_a_stretch_is_logged(gappy, caplog):
     with caplog.at_level("INFO", logger="rfpose.recording.base"):
         assert len(frame_starts(gappy[0], 1000)) == 3
-    assert "500 samples at the end of 1 of 1 stretches" in caplog.text
+    assert "500 samples at the ends of 1 of 1 stretches" in caplog.text
 
 
 def test_recording_without_samples_has_no_frames(tmp_path):

@@ -68,7 +68,8 @@ def measure_tones(
     Parameters
     ----------
     recording
-        Open recording; a receiver that it lacks, and a frame with a gap, become NaN with a status.
+        Open recording; a receiver that it lacks, and a frame with a gap, become NaN with a status. A receiver that
+        started some samples beside the others is measured in its own frame; see `Recording.frame_at`.
     scenario
         The site; its receiver axis is the result's.
     frame_start_index : (frame,)
@@ -158,9 +159,10 @@ class _Reader:
         if receiver_id not in self._recording.receiver_ids:
             return LineStatus.NOT_RECORDED
         with self._lock:
-            if not self._recording.covers(receiver_id, start, self._n_sample):
+            begin = self._recording.frame_at(receiver_id, start, self._n_sample)
+            if begin is None:
                 return LineStatus.GAP
-            return self._recording.read(receiver_id, start, self._n_sample, out=self._buffer())
+            return self._recording.read(receiver_id, begin, self._n_sample, out=self._buffer())
 
     def _buffer(self) -> Samples:
         if not hasattr(self._own, "buffer"):

@@ -129,10 +129,11 @@ def _spectrum(recording: Recording, scenario: Scenario, receiver_id: str) -> tup
     from scipy.signal import welch
 
     n_sample = scenario.radio.frame_samples
-    starts = [int(s) for s in frame_starts(recording, n_sample) if recording.covers(receiver_id, int(s), n_sample)]
-    if not starts:
+    found = (recording.frame_at(receiver_id, int(s), n_sample) for s in frame_starts(recording, n_sample))
+    start = next((s for s in found if s is not None), None)
+    if start is None:
         raise InvalidInputError(f"`receiver_id` {receiver_id} has no frame of {n_sample} samples without a gap")
-    counts = recording.read(receiver_id, starts[0], n_sample).astype(np.float32)
+    counts = recording.read(receiver_id, start, n_sample).astype(np.float32)
     signal = counts[:, 0] + 1j * counts[:, 1]
     rate_hz = float(recording.sample_rate)
     wanted = _LINES_PER_TONE * rate_hz / float(scenario.tone_hz.min())

@@ -274,11 +274,12 @@ def spectrum(
         The file is damaged.
     """
     count = min(n_sample, _SPECTRUM_SAMPLES)
-    if not recording.covers(receiver_id, start_index, count):
+    begin = recording.frame_at(receiver_id, start_index, count)
+    if begin is None:
         return None
     rate_hz = float(recording.sample_rate)
     n_bin = _n_bin(scenario, rate_hz, count)
-    frequency_hz, power = _welch(_complex(recording.read(receiver_id, start_index, count)), rate_hz, n_bin)
+    frequency_hz, power = _welch(_complex(recording.read(receiver_id, begin, count)), rate_hz, n_bin)
     power_db = _decibels(power, recording)
     line_hz = np.empty((0, 0)) if scenario is None else scenario.line_hz
     near = np.maximum.reduce([np.roll(power_db, k) for k in (-2, -1, 0, 1, 2)])
@@ -362,8 +363,9 @@ def waterfall(
         frame = min(int(place), n_frame - 1)
         skip = min(int((place - frame) * frame_samples), frame_samples - n_bin)
         start, count = int(frame_start_index[frame]) + skip, min(_ROW_SEGMENTS * n_bin, frame_samples - skip)
-        if len(inside) and recording.covers(receiver_id, start, count):
-            power = _welch(_complex(recording.read(receiver_id, start, count)), rate_hz, n_bin)[1]
+        begin = recording.frame_at(receiver_id, start, count)
+        if len(inside) and begin is not None:
+            power = _welch(_complex(recording.read(receiver_id, begin, count)), rate_hz, n_bin)[1]
             rows[k] = np.maximum.reduceat(_decibels(power[inside], recording), pick)
         if on_progress is not None:
             on_progress(k + 1, n_row)
@@ -380,9 +382,10 @@ def look_at_frame(recording: Recording, scenario: Scenario, receiver_id: str, st
     """
     plan = LinePlan.from_scenario(scenario)
     n_sample = scenario.radio.frame_samples
-    if not recording.covers(receiver_id, start_index, n_sample):
+    begin = recording.frame_at(receiver_id, start_index, n_sample)
+    if begin is None:
         return _failed(plan, LineStatus.GAP)
-    samples = recording.read(receiver_id, start_index, n_sample)
+    samples = recording.read(receiver_id, begin, n_sample)
     tones = ToneExtractor(plan, full_scale=recording.full_scale).measure(samples)
     if not np.isfinite(tones.clock_ppm):
         return FrameLook(tones=tones, analytic=np.empty((plan.n_transmitter, plan.n_tone, 0), np.complex128))
@@ -464,9 +467,10 @@ def phase_track(
 def _measured(
     extractor: ToneExtractor, recording: Recording, name: str, start: int, n_sample: int, clock_ppm: float | None
 ) -> FrameTones:
-    if not recording.covers(name, start, n_sample):
+    begin = recording.frame_at(name, start, n_sample)
+    if begin is None:
         return FrameTones.failed(extractor.plan.n_transmitter, extractor.plan.n_tone, LineStatus.GAP)
-    return extractor.measure(recording.read(name, start, n_sample), clock_ppm=clock_ppm)
+    return extractor.measure(recording.read(name, begin, n_sample), clock_ppm=clock_ppm)
 
 
 def phases_of(

@@ -53,6 +53,10 @@ STORED_DTYPE: Final[Mapping[str, np.dtype[Any]]] = {
 FILL_VALUE: Final[Mapping[str, float]] = {"int16": -(2**15), "complex64": float("nan")}
 """What stands in I and in Q where a file has room for a sample that was never written; Digital RF's choice too."""
 
+_FRAME_PER_SHIFT: Final = 4
+"""A receiver's own frame lies at most this part of a frame beside the common one: much of it is the same stretch of
+time, in which the mirrors are taken to stand still."""
+
 
 class GapError(RecordingError):
     """Samples were asked for that the receiver did not record."""
@@ -192,6 +196,39 @@ class Recording(ABC):
         """Tell whether a receiver recorded all of ``count`` samples from ``start_index`` on."""
         return self._recorded_from(receiver_id, start_index) >= count
 
+    def frame_at(self, receiver_id: str, start_index: int, frame_samples: int) -> int | None:
+        """Return where a receiver's own frame begins that stands for the common one, or None if it has none.
+
+        Receivers that are triggered start a few samples apart, and a burst of just one frame then never covers the
+        common grid. Its phases at its own frame's centre do as well: only differences between transmitters are
+        used, and a whole number of samples moves all of one receiver's phases alike.
+
+        Parameters
+        ----------
+        receiver_id
+            One of `receiver_ids`.
+        start_index
+            First sample of the common frame; see `frame_starts`.
+        frame_samples
+            Samples in a frame.
+
+        Returns
+        -------
+        int or None
+            ``start_index`` where the receiver recorded all of the frame; else the first sample of the nearest
+            frame within one of its blocks, at most a quarter of a frame away.
+        """
+        blocks = self.blocks(receiver_id)
+        slack = frame_samples // _FRAME_PER_SHIFT
+        first, last = np.searchsorted(blocks[:, 0], [start_index - frame_samples, start_index + slack], side="right")
+        near = blocks[max(first - 1, 0) : last]
+        near = near[near[:, 1] >= frame_samples]
+        begin = np.clip(start_index, near[:, 0], near[:, 0] + near[:, 1] - frame_samples)
+        shift = np.abs(begin - start_index)
+        if not len(near) or shift.min() > slack:
+            return None
+        return int(begin[np.argmin(shift)])
+
     def read(self, receiver_id: str, start_index: int, count: int, out: IqArray | None = None) -> IqArray:
         """Read samples by absolute index.
 
@@ -280,9 +317,10 @@ def recorded_runs(recording: Recording) -> IndexArray:
 def frame_starts(recording: Recording, frame_samples: int) -> IndexArray:
     """Lay one grid of frames over a recording, the same for all receivers.
 
-    Frames lie back to back from the start of each stretch in which at least one receiver recorded. What is
-    left at the end of a stretch is shorter than a frame and not used. A receiver that misses part of a frame
-    is found with `Recording.covers`.
+    Frames lie back to back in each stretch in which at least one receiver recorded. They begin where the receivers
+    together have most frames without a loss, at the earliest such place: at the start of the stretch if all started
+    with it, else where most of them have started. What is left at the ends of a stretch is not used. A receiver that
+    misses part of a frame is found with `Recording.frame_at`.
 
     Parameters
     ----------
@@ -304,16 +342,44 @@ def frame_starts(recording: Recording, frame_samples: int) -> IndexArray:
     if frame_samples < 1:
         raise InvalidInputError(f"`frame_samples` must be one or more, got {frame_samples}")
     runs = recorded_runs(recording)
-    n_frame, left_over = np.divmod(runs[:, 1], frame_samples)
+    offset = _best_offsets(recording, runs, frame_samples)
+    n_frame, left_over = np.divmod(runs[:, 1] - offset, frame_samples)
+    left_over = left_over + offset
     if left_over.any():
         _log.info(
-            "%s: %d samples at the end of %d of %d stretches are shorter than a frame of %d and are not used",
+            "%s: %d samples at the ends of %d of %d stretches are shorter than a frame of %d and are not used",
             recording.path, left_over.sum(), np.count_nonzero(left_over), len(runs), frame_samples,
         )  # fmt: skip
     first_frame = np.repeat(np.cumsum(n_frame) - n_frame, n_frame)
     within_run = np.arange(n_frame.sum(), dtype=np.int64) - first_frame
-    starts: IndexArray = np.repeat(runs[:, 0], n_frame) + within_run * frame_samples
+    starts: IndexArray = np.repeat(runs[:, 0] + offset, n_frame) + within_run * frame_samples
     return starts
+
+
+def _best_offsets(recording: Recording, runs: IndexArray, frame_samples: int) -> IndexArray:
+    """Return (run,) how many samples after the start of each run its frames begin, less than a frame.
+
+    As the grid moves on from the run's start, a block gains a frame when its own start is reached, and loses one
+    when its end no longer holds the last: two steps a block, so one sorted walk finds the best place.
+    """
+    blocks = np.concatenate([recording.blocks(name) for name in recording.receiver_ids])
+    blocks = blocks[blocks[:, 1] >= frame_samples]
+    i_run = np.searchsorted(runs[:, 0], blocks[:, 0], side="right") - 1
+    gained = (blocks[:, 0] - runs[i_run, 0]) % frame_samples
+    lost = (blocks[:, 0] + blocks[:, 1] - runs[i_run, 0]) % frame_samples + 1
+    run = np.concatenate([np.arange(len(runs)), i_run[gained > 0], i_run[lost < frame_samples]])
+    place = np.concatenate([np.zeros(len(runs), np.int64), gained[gained > 0], lost[lost < frame_samples]])
+    n_step = len(runs), int(np.count_nonzero(gained)), int(np.count_nonzero(lost < frame_samples))
+    step = np.repeat(np.array([0, 1, -1]), n_step)
+    order = np.lexsort((place, run))
+    run, place, total = run[order], place[order], np.cumsum(step[order])
+    # steps at one place count together: what holds there is the total after the last of them
+    is_last = np.concatenate([(run[1:] != run[:-1]) | (place[1:] != place[:-1]), [True]])[: len(run)]
+    run, place, total = run[is_last], place[is_last], total[is_last]
+    best_first = np.lexsort((place, -total, run))
+    _, first = np.unique(run[best_first], return_index=True)
+    offset: IndexArray = place[best_first][first]
+    return offset
 
 
 def _merge(rows: IndexArray) -> IndexArray:
