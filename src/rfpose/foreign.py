@@ -96,9 +96,9 @@ def exact_number(name: str, value: Any) -> Fraction:
 
 
 def exact_rate(name: str, value: Any) -> Fraction:
-    """Return a sample rate [1/s] as the nearest fraction with a denominator up to a million.
+    """Return a sample rate [1/s]; a decimal number becomes the nearest fraction with a denominator up to a million.
 
-    Files give rates as decimal numbers, which cannot say a third.
+    Files that give rates as decimal numbers cannot say a third. A fraction stays as it is.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def exact_rate(name: str, value: Any) -> Fraction:
         raise InvalidInputError(
             f"`{name}` must be a rate from {float(_RATES[0]):g} to {float(_RATES[1]):g} a second, got {_short(rate)}"
         )
-    return rate.limit_denominator(_LARGEST_DENOMINATOR)
+    return rate if isinstance(value, numbers.Rational) else rate.limit_denominator(_LARGEST_DENOMINATOR)
 
 
 def _short(number: Fraction) -> str:

@@ -18,6 +18,7 @@ __all__ = [
     "common_options",
     "emit_json",
     "examples",
+    "follow_links_option",
     "force_option",
     "progress",
     "say",
@@ -51,6 +52,15 @@ def common_options(function: F) -> F:
 def force_option(function: F) -> F:
     """Add ``--force`` to a command that writes files."""
     return click.option("--force", is_flag=True, help="Overwrite what exists.")(function)
+
+
+def follow_links_option(function: F) -> F:
+    """Add ``--follow-links`` to a command that opens recordings."""
+    return click.option(
+        "--follow-links",
+        is_flag=True,
+        help="Read what a recording names outside its own folder. [default: refuse; it may come from elsewhere]",
+    )(function)
 
 
 def examples(*lines: str) -> str:

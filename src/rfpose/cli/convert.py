@@ -7,7 +7,16 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
+from rfpose.cli._support import (
+    common_options,
+    emit_json,
+    examples,
+    follow_links_option,
+    force_option,
+    progress,
+    say,
+    wants_json,
+)
 
 __all__ = ["FORMAT_NAMES", "command"]
 
@@ -28,15 +37,21 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
     "--to", "format_name", type=click.Choice(FORMAT_NAMES), default="rfpose-iq", show_default=True, help="Format."
 )
 @click.option("--scenario", type=click.Path(path_type=Path), help="Site description to go with it.")
+@follow_links_option
 @force_option
 @common_options
-def command(recording: Path, output: Path, format_name: Any, scenario: Path | None, force: bool) -> None:
+def command(
+    recording: Path, output: Path, format_name: Any, scenario: Path | None, follow_links: bool, force: bool
+) -> None:
     """Write a recording in another format; samples, times and gaps stay exactly as they are."""
     from rfpose.recording import convert, open_recording
     from rfpose.scenario import load_scenario
 
     given = None if scenario is None else load_scenario(scenario)
-    with open_recording(recording, scenario=given) as source, progress("Converting") as on_progress:
+    with (
+        open_recording(recording, scenario=given, follow_links=follow_links) as source,
+        progress("Converting") as on_progress,
+    ):
         convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
         found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
     if wants_json():

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, say, table, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, say, table, wants_json
 
 if TYPE_CHECKING:
     from rfpose.pipeline.evaluate import Evaluation, Statistics
@@ -26,8 +26,9 @@ __all__ = ["command", "show_evaluation"]
 @click.option(
     "--truth", type=click.Path(path_type=Path), help="Recording with truth, or JSON; else what the result carries."
 )
+@follow_links_option
 @common_options
-def command(result: Path, truth: Path | None) -> None:
+def command(result: Path, truth: Path | None, follow_links: bool) -> None:
     """Compare a result with the truth and with the best that its noise allows.
 
     Errors are of the mirror normal; the beam's are twice that.
@@ -39,7 +40,9 @@ def command(result: Path, truth: Path | None) -> None:
     found = read_result(result)
     if truth is None and found.truth is None:
         raise RecordingError(f"{result}: carries no truth; add --truth FILE (a simulated recording or JSON)")
-    evaluation = evaluate(found, None if truth is None else read_truth(truth, found.scenario))
+    evaluation = evaluate(
+        found, None if truth is None else read_truth(truth, found.scenario, follow_links=follow_links)
+    )
     if wants_json():
         emit_json(evaluation.as_dict())
         return

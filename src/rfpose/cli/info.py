@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, say, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, say, wants_json
 
 __all__ = ["command"]
 
@@ -23,12 +23,13 @@ __all__ = ["command"]
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
+@follow_links_option
 @common_options
-def command(file: Path) -> None:
+def command(file: Path, follow_links: bool) -> None:
     """Say what a recording, a result, a scenario or a file of mounts holds and whether it is sound."""
     from rfpose.pipeline.inspect import inspect_file
 
-    found = inspect_file(file)
+    found = inspect_file(file, follow_links=follow_links)
     if wants_json():
         emit_json(found)
         return
@@ -40,8 +41,8 @@ def _print(data: Mapping[str, Any], *, indent: int) -> None:
     for key, value in data.items():
         name = " " * indent + key.replace("_", " ")
         if isinstance(value, Mapping) and value and all(isinstance(item, Mapping) for item in value.values()):
-            say(f"{name}:")
-            for row, facts in value.items():
+            say(f"{name}: {len(value)}")
+            for row, facts in _alike(value).items():
                 say(
                     f"{' ' * indent}  {row}: "
                     + ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in facts.items())
@@ -51,6 +52,26 @@ def _print(data: Mapping[str, Any], *, indent: int) -> None:
             _print(value, indent=indent + 2)
         else:
             say(f"{name}: {_text(value)}")
+
+
+def _alike(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Sum up rows whose facts are the same but for measured numbers, of which the range is told."""
+    groups: dict[str, list[str]] = {}
+    for name, facts in rows.items():
+        same = {key: value for key, value in facts.items() if not isinstance(value, float)}
+        groups.setdefault(repr(same) + repr(list(facts)), []).append(name)
+    summed = {}
+    for names in groups.values():
+        title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]} ({len(names)} alike)"
+        summed[title] = {key: _range([rows[name][key] for name in names]) for key in rows[names[0]]}
+    return summed
+
+
+def _range(values: list[Any]) -> Any:
+    """Return the one value of all, or the range of numbers."""
+    if not isinstance(values[0], float) or min(values) == max(values):
+        return values[0]
+    return f"{_text(min(values))} to {_text(max(values))}"
 
 
 def _text(value: Any) -> str:

@@ -12,6 +12,7 @@ from rfpose.cli._support import (
     common_options,
     emit_json,
     examples,
+    follow_links_option,
     force_option,
     progress,
     say,
@@ -75,6 +76,7 @@ REFLECTION_NAMES = ("estimate", "ignore")
     "[default: as the scenario's [motion] says: off]",
 )
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
+@follow_links_option
 @force_option
 @common_options
 @click.pass_obj
@@ -89,6 +91,7 @@ def command(
     integrity: bool | None,
     filtered: bool | None,
     csv_path: Path | None,
+    follow_links: bool,
     force: bool,
 ) -> None:
     """Find receiver positions and mirror normals in a recording.
@@ -114,6 +117,7 @@ def command(
             reflection=reflection,
             integrity=integrity,
             filtered=filtered,
+            follow_links=follow_links,
             force=force,
             on_progress=on_progress,
         )

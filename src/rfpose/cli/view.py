@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, say, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, force_option, say, wants_json
 
 __all__ = ["command"]
 
@@ -34,6 +34,7 @@ THEMES = ("light", "dark")
 @click.option("--size", type=(click.IntRange(min=400), click.IntRange(min=300)), default=(1280, 800),
               show_default=True, metavar="WIDTH HEIGHT", help="Size of the window or picture [pixel].")  # fmt: skip
 @click.option("--theme", type=click.Choice(THEMES), help="Default: light for pictures, the last one for the window.")
+@follow_links_option
 @force_option
 @common_options
 def command(
@@ -46,13 +47,14 @@ def command(
     frame: int,
     size: tuple[int, int],
     theme: str | None,
+    follow_links: bool,
     force: bool,
 ) -> None:
     """Open the viewer, or with --save draw one of its views without a screen."""
     if save is None:
         from rfpose.viewer.app import run
 
-        code = run(file, scenario_path=scenario, theme=theme, size=size)
+        code = run(file, scenario_path=scenario, theme=theme, size=size, follow_links=follow_links)
         if wants_json():
             emit_json({"file": file, "saved": None, "view": None})
         if code:
@@ -71,6 +73,7 @@ def command(
         save,
         view=view,
         scenario_path=scenario,
+        follow_links=follow_links,
         theme=theme or THEMES[0],
         size=size,
         heliostat=heliostat,

@@ -213,11 +213,12 @@ class Evaluation:
 # -- truth ---------------------------------------------------------------------------------------------------
 
 
-def read_truth(path: str | Path, scenario: Scenario) -> Truth:
+def read_truth(path: str | Path, scenario: Scenario, *, follow_links: bool = False) -> Truth:
     """Read a truth from a recording, a result or a JSON file, with rows in the scenario's order.
 
     The JSON file holds ``heliostats``, a list of ``id``, ``normal_enu`` and ``receivers_enu_m`` (positions in the
-    order of the scenario's ``receiver_ids``); it holds for every frame.
+    order of the scenario's ``receiver_ids``); it holds for every frame. ``follow_links`` is as for
+    `rfpose.recording.open_recording`.
 
     Raises
     ------
@@ -230,7 +231,7 @@ def read_truth(path: str | Path, scenario: Scenario) -> Truth:
     if is_result(path):
         truth = read_result(path).truth
     else:
-        with open_recording(path) as recording:
+        with open_recording(path, follow_links=follow_links) as recording:
             truth = recording.truth
     if truth is None:
         raise RecordingError(f"{path}: holds no truth; give a simulated recording or a JSON file")

@@ -19,8 +19,15 @@ from rfpose.scenario import Scenario, load_scenario
 __all__ = ["inspect_file"]
 
 
-def inspect_file(path: str | Path) -> dict[str, Any]:
+def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, Any]:
     """Describe a recording, a result, a scenario or a file of mounts, ready for JSON.
+
+    Parameters
+    ----------
+    path
+        The file, or a recording's directory.
+    follow_links
+        As for `rfpose.recording.open_recording`.
 
     Returns
     -------
@@ -40,7 +47,7 @@ def inspect_file(path: str | Path) -> dict[str, Any]:
         return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
     if path.is_file() and is_result(path):
         return {"kind": "result", "path": str(path), **_result(path)}
-    with open_recording(path) as recording:
+    with open_recording(path, follow_links=follow_links) as recording:
         return {"kind": "recording", **describe(recording)}
 
 

@@ -21,7 +21,7 @@ from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_file import write_result
 from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.pipeline.truth_rows import align_truth
-from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["process"]
@@ -39,6 +39,7 @@ def process(
     reflection: str | None = None,
     integrity: bool | None = None,
     filtered: bool | None = None,
+    follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,
@@ -66,6 +67,8 @@ def process(
         Whether residuals are tested and bad transmitters left out; None: as the scenario's ``[integrity]`` says.
     filtered
         Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
+    follow_links
+        As for `rfpose.recording.open_recording`.
     force
         Overwrite an existing result, and discard unfinished work of another job on the same result.
     on_progress
@@ -89,12 +92,13 @@ def process(
         raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
     refuse_existing(result_path, force=force)
     given = None if scenario_path is None else load_scenario(scenario_path)
-    with open_recording(recording_path) as recording:
+    with open_recording(recording_path, follow_links=follow_links) as recording:
         scenario = _choose_scenario(recording, given)
         check_against(recording, scenario)
         choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
         check_solvable(scenario, pose=pose, choice=choice)
         _note_differing_receivers(recording, scenario)
+        note_doubts(recording)
         starts = _frames(recording, scenario)
         journal = Journal(
             result_path.with_name(f"{result_path.name}.partial"),

@@ -192,6 +192,8 @@ class SharedRecording(Recording):
             truth=inner.truth,
             provenance=inner.provenance,
         )
+        self.doubts = inner.doubts
+        self.time_known = inner.time_known
         self._inner = inner
         self._lock = threading.RLock()
         self._closed = False

@@ -6,7 +6,7 @@
 from rfpose.recording.base import GapError, Recording, count_fill, frame_starts, recorded_runs
 from rfpose.recording.conversion import convert
 from rfpose.recording.opening import open_recording
-from rfpose.recording.summary import check_against, describe
+from rfpose.recording.summary import check_against, describe, note_doubts
 from rfpose.recording.writer import RecordingWriter
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "count_fill",
     "describe",
     "frame_starts",
+    "note_doubts",
     "open_recording",
     "recorded_runs",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +31,7 @@ __all__ = [
     "as_stored",
     "count_fill",
     "frame_starts",
+    "own_frames",
     "recorded_runs",
 ]
 
@@ -108,6 +109,11 @@ class Recording(ABC):
         What was simulated; None for a real recording.
     provenance
         How the recording came about, free text by name.
+    doubts
+        What the file says that cannot be right, or does not say and should, by receiver; one line each. `describe`
+        calls these problems.
+    time_known
+        Whether indices count from the Unix epoch; else the file has no time, and they count from its start.
     """
 
     def __init__(
@@ -134,6 +140,8 @@ class Recording(ABC):
         self.scenario = scenario
         self.truth = truth
         self.provenance: dict[str, str] = dict(provenance or {})
+        self.doubts: dict[str, list[str]] = {}
+        self.time_known = True
         self._segments: dict[str, IndexArray] = {}
         self._blocks: dict[str, IndexArray] = {}
 
@@ -218,16 +226,8 @@ class Recording(ABC):
             ``start_index`` where the receiver recorded all of the frame; else the first sample of the nearest
             frame within one of its blocks, at most a quarter of a frame away.
         """
-        blocks = self.blocks(receiver_id)
-        slack = frame_samples // _FRAME_PER_SHIFT
-        first, last = np.searchsorted(blocks[:, 0], [start_index - frame_samples, start_index + slack], side="right")
-        near = blocks[max(first - 1, 0) : last]
-        near = near[near[:, 1] >= frame_samples]
-        begin = np.clip(start_index, near[:, 0], near[:, 0] + near[:, 1] - frame_samples)
-        shift = np.abs(begin - start_index)
-        if not len(near) or shift.min() > slack:
-            return None
-        return int(begin[np.argmin(shift)])
+        begin = int(own_frames(self.blocks(receiver_id), np.array([start_index]), frame_samples)[0])
+        return None if begin < 0 else begin
 
     def read(self, receiver_id: str, start_index: int, count: int, out: IqArray | None = None) -> IqArray:
         """Read samples by absolute index.
@@ -308,9 +308,10 @@ class Recording(ABC):
         return out[:count]
 
 
-def recorded_runs(recording: Recording) -> IndexArray:
-    """Return the stretches in which at least one receiver recorded: (run, 2) rows [start index, count]."""
-    rows = np.concatenate([recording.blocks(name) for name in recording.receiver_ids])
+def recorded_runs(recording: Recording, receiver_ids: Sequence[str] | None = None) -> IndexArray:
+    """Return the stretches in which at least one receiver (of those named) recorded: (run, 2) [start index, count]."""
+    names = recording.receiver_ids if receiver_ids is None else receiver_ids
+    rows = np.concatenate([np.empty((0, 2), np.int64), *(recording.blocks(name) for name in names)])
     return _merge(rows[np.argsort(rows[:, 0], kind="stable")])
 
 
@@ -354,6 +355,32 @@ def frame_starts(recording: Recording, frame_samples: int) -> IndexArray:
     within_run = np.arange(n_frame.sum(), dtype=np.int64) - first_frame
     starts: IndexArray = np.repeat(runs[:, 0] + offset, n_frame) + within_run * frame_samples
     return starts
+
+
+def own_frames(blocks: IndexArray, starts: IndexArray, frame_samples: int) -> IndexArray:
+    """Return (frame,) where a receiver's own frames begin, −1: it has none; see `Recording.frame_at`.
+
+    Parameters
+    ----------
+    blocks : (block, 2)
+        As `Recording.blocks` gives them.
+    starts : (frame,)
+        First sample of each common frame.
+    frame_samples
+        Samples in a frame.
+    """
+    blocks = blocks[blocks[:, 1] >= frame_samples]
+    if not len(blocks):
+        return np.full(len(starts), -1, np.int64)
+    before = np.searchsorted(blocks[:, 0], starts, side="right") - 1
+    # none lies nearer than in the block that began last or in the next to begin
+    near = np.clip(np.stack([before, before + 1]), 0, len(blocks) - 1)
+    begin = np.clip(starts, blocks[near, 0], blocks[near].sum(axis=2) - frame_samples)
+    shift = np.abs(begin - starts)
+    nearest = np.argmin(shift, axis=0)[None]
+    begin, shift = (np.take_along_axis(rows, nearest, 0)[0] for rows in (begin, shift))
+    found: IndexArray = np.where(shift <= frame_samples // _FRAME_PER_SHIFT, begin, -1)
+    return found
 
 
 def _best_offsets(recording: Recording, runs: IndexArray, frame_samples: int) -> IndexArray:

@@ -8,8 +8,6 @@ import os
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime, timedelta
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,6 +21,7 @@ from rfpose.recording.opening import open_recording
 from rfpose.recording.output import temporary_beside
 from rfpose.recording.sidecar import SCENARIO_FILE
 from rfpose.recording.sigmf_files import DATATYPES, META_SUFFIX, import_sigmf
+from rfpose.recording.stamps import stamp_text
 from rfpose.recording.writer import RecordingWriter
 
 __all__ = ["convert"]
@@ -32,7 +31,6 @@ _log = logging.getLogger(__name__)
 _PIECE_SAMPLES = 2**20
 _SUBDIRECTORY_SECONDS = 3600
 _FILE_MILLISECONDS = 1000
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def convert(
@@ -220,19 +218,12 @@ class _SigmfStream(_Stream):
         )
         offset = 0
         for start, count in self.source.blocks(self.receiver_id).tolist():
-            capture = {"core:global_index": start, "core:datetime": _datetime_text(start, self.source.sample_rate)}
+            capture = {"core:global_index": start, "core:datetime": stamp_text(start, self.source.sample_rate)}
             if self.source.centre_frequency_hz is not None:
                 capture["core:frequency"] = self.source.centre_frequency_hz
             meta.add_capture(offset, metadata=capture)
             offset += count
         meta.tofile(str(self._data.with_suffix(META_SUFFIX)))
-
-
-def _datetime_text(index: int, rate: Fraction) -> str:
-    """Return the time of a sample in UTC, to the picosecond."""
-    picoseconds = round(index / rate * 10**12)
-    whole = _EPOCH + timedelta(seconds=picoseconds // 10**12)
-    return f"{whole:%Y-%m-%dT%H:%M:%S}.{picoseconds % 10**12:012d}Z"
 
 
 def _to_directory(

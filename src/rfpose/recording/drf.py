@@ -1,21 +1,28 @@
-"""Digital RF recordings, read through the digital_rf library: every channel is a receiver."""
+"""Digital RF recordings: every channel is a receiver.
+
+The digital_rf library says which files belong to a channel; they are read here. Its own readers trust what the files
+declare, leave out files that they cannot open, and the reader of metadata deletes such files.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, NamedTuple
 
+import h5py
 import numpy as np
 
-from rfpose.errors import RecordingError
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.foreign import exact_number, exact_rate
 from rfpose.recording.base import IndexArray, IqArray, Recording, SampleFormat
+from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
+from rfpose.recording.links import refuse_tree_outside
 from rfpose.recording.sidecar import load_sidecar_scenario
+from rfpose.recording.stamps import LARGEST_INDEX
 from rfpose.scenario import Scenario
 
 __all__ = ["CENTRE_FREQUENCIES", "DigitalRfRecording", "import_digital_rf"]
@@ -25,10 +32,14 @@ _log = logging.getLogger(__name__)
 CENTRE_FREQUENCIES = "center_frequencies"
 """Field of a channel's Digital Metadata under which its own recorder, thor, notes the tuning, one a subchannel."""
 
+_PROPERTIES: Final = "drf_properties.h5"
 _CACHE_BYTES = 2**28
 """Over all channels. A compressed file is inflated chunk by chunk, and a chunk may hold many frames."""
+_MOST_SUBCHANNELS = 1024
 # H5Tget_class, bytes a component
 _SAMPLE_FORMATS: dict[tuple[int, int], SampleFormat] = {(0, 2): "int16", (1, 4): "complex64"}
+_HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError)
+"""What h5py raises at what it cannot read or has no type for."""
 
 
 def import_digital_rf() -> Any:
@@ -42,117 +53,382 @@ def import_digital_rf() -> Any:
     return digital_rf
 
 
+class _Channel(NamedTuple):
+    """What a channel's properties say, and its files in order of time."""
+
+    directory: Path
+    rate: Fraction
+    sample_format: SampleFormat
+    n_subchannel: int
+    files: list[Path]
+    version: str
+
+
+class _Piece(NamedTuple):
+    """A stretch without a gap within one file."""
+
+    start: int
+    length: int
+    offset: int
+    file: Path
+
+
 class DigitalRfRecording(Recording):
     """A Digital RF directory. Open it through `open_recording`.
 
     A channel of several subchannels gives one receiver a subchannel: ``CHANNEL_r0``, ``CHANNEL_r1`` and so on.
     """
 
-    def __init__(self, path: Path, *, scenario: Scenario | None = None) -> None:
+    def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         library = import_digital_rf()
-        self._path = path
-        with self._library_errors("drf_properties.h5"):
-            n_channel = sum(1 for _ in path.glob("*/drf_properties.h5"))
-            self._reader = library.DigitalRFReader(str(path), rdcc_nbytes=_CACHE_BYTES // n_channel)
-            properties = {name: self._reader.get_properties(name) for name in self._reader.get_channels()}
-        first = next(iter(properties))
-        sample_format = self._checked_format(first, properties[first])
-        for name, found in properties.items():
-            if self._checked_format(name, found) != sample_format or _rate(found) != _rate(properties[first]):
+        if not follow_links:
+            refuse_tree_outside(path)
+        self._follow_links = follow_links
+        self._channels = {
+            properties.parent.name: _channel(library, properties, follow_links=follow_links)
+            for properties in sorted(path.glob(f"*/{_PROPERTIES}"))
+        }
+        first_name, first = next(iter(self._channels.items()))
+        for name, channel in self._channels.items():
+            if (channel.sample_format, channel.rate) != (first.sample_format, first.rate):
                 raise RecordingError(
-                    f"{path}: channel `{name}` ({_rate(found)} Hz) and channel `{first}` ({sample_format} at "
-                    f"{_rate(properties[first])} Hz) differ in rate or type; put them into separate directories"
+                    f"{path}: channel `{name}` ({channel.rate} Hz) and channel `{first_name}` ({first.sample_format} "
+                    f"at {first.rate} Hz) differ in rate or type; put them into separate directories"
                 )
-        self._place: dict[str, tuple[str, int]] = {}
-        for name, found in properties.items():
-            n_subchannel = int(found["num_subchannels"])
-            for k in range(n_subchannel):
-                receiver_id = name if n_subchannel == 1 else f"{name}_r{k}"
-                if receiver_id in self._place:
-                    raise RecordingError(
-                        f"{path}: a channel `{receiver_id}` stands beside subchannel {k} of `{name}`, which is read "
-                        "under the same name; rename one of the directories"
-                    )
-                self._place[receiver_id] = (name, k)
+        self._place = _receivers(path, self._channels)
+        self._pieces: dict[str, list[_Piece]] = {}
+        self._opened: dict[str, tuple[Path, h5py.File, h5py.Dataset]] = {}
+        self._told: dict[str, list[str]] = {name: [] for name in self._place}
+        for name, (channel_name, _) in self._place.items():
+            self._told[name] += _unfinished(self._channels[channel_name].directory)
         super().__init__(
             path,
             format="digital-rf",
             receiver_ids=tuple(self._place),
-            sample_rate=_rate(properties[first]),
-            centre_frequency_hz=self._centre_frequency(first),
-            sample_format=sample_format,
-            full_scale=32767.0 if sample_format == "int16" else math.inf,
-            scenario=scenario if scenario is not None else load_sidecar_scenario(path),
-            provenance={
-                "digital_rf_version": str(properties[first].get("digital_rf_version", "")),
-                "channels": ", ".join(properties),
-            },
+            sample_rate=first.rate,
+            centre_frequency_hz=self._centre_frequency(library),
+            sample_format=first.sample_format,
+            full_scale=32767.0 if first.sample_format == "int16" else math.inf,
+            scenario=scenario if scenario is not None else load_sidecar_scenario(path, follow_links=follow_links),
+            provenance={"digital_rf_version": first.version, "channels": ", ".join(self._channels)},
         )
+        self.doubts = self._told
 
     def close(self) -> None:
-        """Release the library's open file."""
-        self._reader.close()
+        """Close the files that are open."""
+        for _, file, _ in self._opened.values():
+            file.close()
+        self._opened.clear()
 
-    def _checked_format(self, channel: str, found: dict[str, Any]) -> SampleFormat:
-        kind, size, is_complex = int(found["H5Tget_class"]), int(found["H5Tget_size"]), bool(found["is_complex"])
-        sample_format = _SAMPLE_FORMATS.get((kind, size))
-        if sample_format is None or not is_complex:
-            raise RecordingError(
-                f"{self._path}: channel `{channel}` holds {'complex' if is_complex else 'real'} samples of {8 * size} "
-                f"bits ({ {0: 'integer', 1: 'float'}.get(kind, 'other') }); rfpose reads complex int16 and complex "
-                "float32: record or convert it to one of them"
-            )
-        return sample_format
-
-    def _centre_frequency(self, channel: str) -> float | None:
-        try:
-            latest = self._reader.get_digital_metadata(channel).read_latest(CENTRE_FREQUENCIES)
-            value = float(np.ravel(next(iter(latest.values())))[0])
-        except (OSError, KeyError, ValueError, StopIteration, IndexError, TypeError) as error:
-            _log.debug("%s: no tuning in the metadata of channel %s: %s", self._path, channel, error)
-            return None
-        return value if math.isfinite(value) else None
+    # -- samples -----------------------------------------------------------------------------------------
 
     def _load_segments(self, receiver_id: str) -> IndexArray:
-        channel, _ = self._place[receiver_id]
-        with self._library_errors(channel):
-            first, last = self._reader.get_bounds(channel)
-            if first is None or last is None:
-                return np.empty((0, 2), np.int64)
-            blocks = self._reader.get_continuous_blocks(first, last, channel)
-        return np.array(list(blocks.items()), np.int64).reshape(-1, 2)
+        channel = self._place[receiver_id][0]
+        if channel not in self._pieces:
+            pieces: list[_Piece] = []
+            for path in self._channels[channel].files:
+                found = self._pieces_in(channel, path)
+                if found and pieces and found[0].start < pieces[-1].start + pieces[-1].length:
+                    raise RecordingError(
+                        f"{path}: starts with sample {found[0].start}, before `{pieces[-1].file.name}` ends; remove "
+                        "one of the two"
+                    )
+                pieces += found
+            self._pieces[channel] = pieces
+        return np.array([(piece.start, piece.length) for piece in self._pieces[channel]], np.int64).reshape(-1, 2)
+
+    def _pieces_in(self, channel: str, path: Path) -> list[_Piece]:
+        """Return the stretches in one file; a file to which nothing was written has none."""
+        try:
+            with h5py.File(path, "r") as file:
+                if file.get("rf_data", getlink=True) is None or file.get("rf_data_index", getlink=True) is None:
+                    _log.warning("%s: corrupt file, without samples; it is left out", path)
+                    self._tell(channel, f"its file `{path.name}` holds no samples")
+                    return []
+                n_sample = len(_samples(file, self._channels[channel], self._follow_links))
+                table = _index(file, n_sample, self._follow_links)
+        except _HDF5_ERRORS as error:
+            raise _unreadable(path, channel, error) from error
+        ends = np.append(table[1:, 1], n_sample)
+        return [
+            _Piece(start, end - offset, offset, path)
+            for (start, offset), end in zip(table.tolist(), ends.tolist(), strict=True)
+            if end > offset
+        ]
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         channel, k = self._place[receiver_id]
-        first = int(self._segments[receiver_id][i_segment, 0]) + skip
-        with self._library_errors(channel):
-            pieces = self._reader.read(first, first + len(out) - 1, channel, sub_channel=k)
-        if sum(len(piece) for piece in pieces.values()) != len(out):
-            raise RecordingError(
-                f"{self.path}: channel `{channel}` lost samples after {first} since it was opened; open it again when "
-                "nothing writes to it"
-            )
-        done = 0
-        for piece in pieces.values():
-            component = piece.dtype["r"] if piece.dtype.names else piece.real.dtype
-            out[done : done + len(piece)] = piece.view(component).reshape(-1, 2)
-            done += len(piece)
-
-    @contextlib.contextmanager
-    def _library_errors(self, place: str) -> Iterator[None]:
-        """Turn the library's errors into ours, and what it prints into log messages."""
-        printed = io.StringIO()
+        piece = self._pieces[channel][i_segment]
+        first = piece.offset + skip
         try:
-            with contextlib.redirect_stdout(printed):
-                yield
-        except (OSError, KeyError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+            samples = self._data(channel, piece.file)[first : first + len(out), k]
+        except FileNotFoundError as error:
             raise RecordingError(
-                f"{self._path}: cannot read `{place}`: {error}; copy the recording again, or remove the damaged file"
+                f"{self.path}: channel `{channel}` lost samples after {piece.start} since it was opened "
+                f"(`{piece.file.name}` is gone); open it again when nothing writes to it"
             ) from error
-        finally:
-            for line in printed.getvalue().splitlines():
-                _log.warning("%s: %s", self._path, line)
+        except _HDF5_ERRORS as error:
+            raise _unreadable(piece.file, channel, error) from error
+        if len(samples) != len(out):
+            raise RecordingError(f"{piece.file}: became shorter since it was opened; open the recording again")
+        component = samples.dtype["r"] if samples.dtype.names else samples.real.dtype
+        out[:] = np.ascontiguousarray(samples).view(component).reshape(-1, 2)
+
+    def _data(self, channel: str, path: Path) -> h5py.Dataset:
+        """Return a file's samples; one file a channel stays open."""
+        if channel not in self._opened or self._opened[channel][0] != path:
+            if channel in self._opened:
+                self._opened.pop(channel)[1].close()
+            file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES // len(self._channels))
+            try:
+                self._opened[channel] = path, file, _samples(file, self._channels[channel], self._follow_links)
+            except BaseException:
+                file.close()
+                raise
+        return self._opened[channel][2]
+
+    def _tell(self, channel: str, doubt: str) -> None:
+        for name, (own, _) in self._place.items():
+            if own == channel and doubt not in self._told[name]:
+                self._told[name].append(doubt)
+
+    # -- tuning ------------------------------------------------------------------------------------------
+
+    def _centre_frequency(self, library: Any) -> float | None:
+        """Return the one tuning of all receivers at all times, None if no channel notes any."""
+        tuned: dict[str, float] = {}
+        for channel_name, channel in self._channels.items():
+            entries = _tunings(library, channel, follow_links=self._follow_links)
+            if not entries:
+                continue
+            first, last = self._bounds(channel_name)
+            past = [at for at in entries if at <= first]
+            in_force = [entries[at] for at in (*past[-1:], *(at for at in entries if first < at <= last))]
+            changes = [at for at in entries if first < at <= last]
+            for name, (own, k) in self._place.items():
+                if own != channel_name:
+                    continue
+                values = [value for row in in_force if (value := row[k]) is not None]
+                for value in values:
+                    if value != values[0]:
+                        raise RecordingError(
+                            f"{channel.directory / 'metadata'}: `{name}` is tuned to {values[0]:.12g} Hz and to "
+                            f"{value:.12g} Hz while it records (entries at samples "
+                            f"{', '.join(str(at) for at in changes[:4])}); split the recording where the tuning changes"
+                        )
+                if values:
+                    tuned[name] = values[0]
+                if values and not past:
+                    self._told[name].append("its metadata says to what it was tuned only from a later sample on")
+        if not tuned:
+            return None
+        reference, wanted = next(iter(tuned.items()))
+        for name, value in tuned.items():
+            if value != wanted:
+                raise RecordingError(
+                    f"{self._channels[self._place[name][0]].directory / 'metadata'}: `{name}` is tuned to {value:.12g} "
+                    f"Hz, but `{reference}` to {wanted:.12g} Hz; put them into separate directories"
+                )
+        for name in self._place:
+            if name not in tuned:
+                self._told[name].append(f"its metadata does not say to what it was tuned, `{reference}`'s does")
+        return wanted
+
+    def _bounds(self, channel: str) -> tuple[int, int]:
+        """Return the first and last sample of a channel, without opening all of its files."""
+        files = self._channels[channel].files
+        first = next((pieces[0] for path in files if (pieces := self._pieces_in(channel, path))), None)
+        last = next((pieces[-1] for path in reversed(files) if (pieces := self._pieces_in(channel, path))), None)
+        if first is None or last is None:
+            return 0, 0
+        return first.start, last.start + last.length - 1
 
 
-def _rate(properties: dict[str, Any]) -> Fraction:
-    return Fraction(int(properties["sample_rate_numerator"]), int(properties["sample_rate_denominator"]))
+def _channel(library: Any, properties: Path, *, follow_links: bool) -> _Channel:
+    """Read a channel's properties and list its files."""
+    try:
+        with h5py.File(properties, "r") as file:
+            found = {name: _scalar(value) for name, value in file.attrs.items()}
+    except _HDF5_ERRORS as error:
+        raise _unreadable(properties, properties.parent.name, error) from error
+    directory = properties.parent
+    if not directory.name.isprintable():
+        raise RecordingError(f"{properties}: {directory.name!a} is no name for a receiver; rename the directory")
+    try:
+        rate = _rate(found)
+        n_subchannel = _whole(found, "num_subchannels")
+        kind, size = _whole(found, "H5Tget_class"), _whole(found, "H5Tget_size")
+        is_complex = bool(_whole(found, "is_complex"))
+        if not 1 <= n_subchannel <= _MOST_SUBCHANNELS:
+            raise InvalidInputError(f"`num_subchannels` must be 1 to {_MOST_SUBCHANNELS}, is {n_subchannel}")
+    except InvalidInputError as error:
+        raise RecordingError(f"{properties}: {error}; copy the file again") from error
+    sample_format = _SAMPLE_FORMATS.get((kind, size))
+    if sample_format is None or not is_complex:
+        raise RecordingError(
+            f"{directory.parent}: channel `{directory.name}` holds {'complex' if is_complex else 'real'} samples of "
+            f"{8 * size} bits ({ {0: 'integer', 1: 'float'}.get(kind, 'other') }); rfpose reads complex int16 "
+            "and complex float32: record or convert it to one of them"
+        )
+    files = library.ilsdrf(
+        str(directory), recursive=False, include_drf=True, include_dmd=False, include_drf_properties=False
+    )
+    return _Channel(
+        directory=directory,
+        rate=rate,
+        sample_format=sample_format,
+        n_subchannel=n_subchannel,
+        files=[Path(name) for name in files],
+        version=printable(str(found.get("digital_rf_version", ""))),
+    )
+
+
+def _scalar(value: Any) -> Any:
+    """Return an attribute's one value: some versions write arrays of one."""
+    return value.item() if isinstance(value, np.ndarray | np.generic) and value.size == 1 else value
+
+
+def _whole(properties: Mapping[str, Any], name: str) -> int:
+    if name not in properties:
+        raise InvalidInputError(f"attribute `{name}` is missing")
+    value = exact_number(name, properties[name])
+    if value.denominator != 1:
+        raise InvalidInputError(f"`{name}` must be a whole number, is {float(value):g}")
+    return int(value)
+
+
+def _rate(properties: Mapping[str, Any]) -> Fraction:
+    if "sample_rate_numerator" not in properties and "samples_per_second" in properties:  # before version 2.3
+        return exact_rate("samples_per_second", properties["samples_per_second"])
+    numerator, denominator = (_whole(properties, f"sample_rate_{part}") for part in ("numerator", "denominator"))
+    if denominator == 0:
+        raise InvalidInputError("`sample_rate_denominator` must not be zero")
+    return exact_rate("sample_rate_numerator", Fraction(numerator, denominator))
+
+
+def _receivers(path: Path, channels: Mapping[str, _Channel]) -> dict[str, tuple[str, int]]:
+    """Return the channel and subchannel of each receiver."""
+    place: dict[str, tuple[str, int]] = {}
+    for name, channel in channels.items():
+        for k in range(channel.n_subchannel):
+            receiver_id = name if channel.n_subchannel == 1 else f"{name}_r{k}"
+            if receiver_id in place or (receiver_id != name and receiver_id in channels):
+                raise RecordingError(
+                    f"{path}: a channel `{receiver_id}` stands beside subchannel {k} of `{name}`, which is read under "
+                    "the same name; rename one of the directories"
+                )
+            place[receiver_id] = (name, k)
+    return place
+
+
+def _unfinished(directory: Path) -> list[str]:
+    """Tell of files that a recorder had begun: it gives them their names when they are complete."""
+    found = sorted(directory.glob("*/tmp.*.h5"))
+    if not found:
+        return []
+    more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+    return [
+        f"`{found[0].relative_to(directory.parent)}`{more} was not completed: its recorder still writes or was "
+        "stopped, and its samples are not read"
+    ]
+
+
+def _samples(file: h5py.File, channel: _Channel, follow_links: bool) -> h5py.Dataset:
+    """Return a file's samples (sample, subchannel), of exactly the promised type."""
+    found = find_dataset(file, "/rf_data", follow_links=follow_links, per_stored=FROM_SAMPLES)
+    if found is None or found.ndim != 2 or found.shape[1] != channel.n_subchannel:
+        shape = None if found is None else found.shape
+        raise RecordingError(
+            f"{file.filename}: `/rf_data` must be of shape (sample, {channel.n_subchannel}), is {shape}; "
+            "remove the file"
+        )
+    dtype = found.dtype
+    parts = [dtype[name] for name in dtype.names] if dtype.names else [np.dtype(f"f{dtype.itemsize // 2}")]
+    wanted = "i2" if channel.sample_format == "int16" else "f4"
+    is_complex = dtype.kind == "c" or (dtype.names is not None and len(dtype.names) == 2)
+    if not is_complex or any(part.newbyteorder("=") != np.dtype(wanted) for part in parts):
+        kind = f"complex {parts[0].newbyteorder('=').name}" if is_complex else str(dtype)
+        raise RecordingError(
+            f"{file.filename}: channel `{channel.directory.name}` holds {kind} samples; rfpose reads complex int16 and "
+            "complex float32: record or convert it to one of them"
+        )
+    return found
+
+
+def _index(file: h5py.File, n_sample: int, follow_links: bool) -> IndexArray:
+    """Return (stretch, 2) rows [first sample since the epoch, its place in the file], checked."""
+    found = find_dataset(file, "/rf_data_index", follow_links=follow_links, per_stored=FROM_TABLE)
+    if found is None or found.ndim != 2 or found.shape[1] != 2 or found.dtype.kind not in "iu" or not len(found):
+        raise RecordingError(
+            f"{file.filename}: `/rf_data_index` must be integers of shape (stretch, 2); remove the file"
+        )
+    rows = found[()]
+    # before they become signed: numbers from a damaged file must not overflow into plausible ones
+    fits = (rows[:, 0] < LARGEST_INDEX) & (rows[:, 1] <= n_sample) & (rows >= 0).all(axis=1)
+    if fits.all():
+        start, offset = rows.astype(np.int64).T
+        count = np.diff(np.append(offset, n_sample))
+        fits = count >= 0
+        fits[:-1] &= start[1:] >= start[:-1] + count[:-1]
+    if not fits.all():
+        i = int(np.flatnonzero(~fits)[0])
+        raise RecordingError(
+            f"{file.filename}: `/rf_data_index` row {i} is {rows[i].tolist()}, which does not fit the {n_sample} "
+            "samples stored or the row after; copy the file again or remove it"
+        )
+    table: IndexArray = rows.astype(np.int64)
+    return table
+
+
+def _tunings(library: Any, channel: _Channel, *, follow_links: bool) -> dict[int, Sequence[float | None]]:
+    """Return the noted tunings of all subchannels by the sample from which they hold, in order; None: not known."""
+    directory = channel.directory / "metadata"
+    if not directory.is_dir():
+        return {}
+    scale = Fraction(1)
+    entries: dict[int, Sequence[float | None]] = {}
+    files = [
+        Path(name)
+        for name in library.ilsdrf(
+            str(directory), recursive=False, include_drf=False, include_dmd=True, include_dmd_properties=False
+        )
+    ]
+    path = directory / "dmd_properties.h5"
+    try:
+        if path.is_file():
+            with h5py.File(path, "r") as file:
+                scale = channel.rate / _rate({name: _scalar(value) for name, value in file.attrs.items()})
+        for path in files:
+            with h5py.File(path, "r") as file:
+                for index in file:
+                    place = f"/{index}/{CENTRE_FREQUENCIES}"
+                    if not (index.isascii() and index.isdigit() and len(index) < 20):
+                        continue
+                    if find_item(file, place, follow_links=follow_links) is None:
+                        continue
+                    found = find_dataset(file, place, follow_links=follow_links, per_stored=FROM_TABLE)
+                    entries[round(int(index) * scale)] = _frequencies(found, channel.n_subchannel)
+    except InvalidInputError as error:
+        raise RecordingError(f"{path}: {error}; copy the file again") from error
+    except _HDF5_ERRORS as error:
+        raise _unreadable(path, channel.directory.name, error) from error
+    return dict(sorted(entries.items()))
+
+
+def _frequencies(found: h5py.Dataset | None, n_subchannel: int) -> Sequence[float | None]:
+    """Return one frequency a subchannel; a single one is that of all."""
+    if found is None or found.dtype.kind not in "fiu" or found.size not in (1, n_subchannel):
+        shape = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
+        raise InvalidInputError(
+            f"`{CENTRE_FREQUENCIES}` must be {n_subchannel} frequencies, one a subchannel, is {shape}"
+        )
+    values = np.broadcast_to(np.ravel(found[()]).astype(np.float64), n_subchannel).tolist()
+    return [value if math.isfinite(value) else None for value in values]
+
+
+def _unreadable(path: Path, channel: str, error: Exception) -> RecordingError:
+    if isinstance(error, RecordingError):
+        return error
+    return RecordingError(
+        f"{path}: cannot read `{channel}`: {error}; copy the recording again, or remove the damaged file"
+    )

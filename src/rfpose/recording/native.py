@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, cast
@@ -10,51 +12,53 @@ from typing import Any, Final, cast
 import h5py
 import numpy as np
 
-from rfpose.errors import RecordingError, RfposeError
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError
+from rfpose.foreign import exact_rate
 from rfpose.recording import keys
 from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
+from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
 from rfpose.scenario import Scenario, parse_scenario
 from rfpose.truth import Truth
 
 __all__ = ["NativeRecording"]
 
 _REMEDY = "the file is damaged or was not written by rfpose: make it again with `rfpose convert` or `rfpose simulate`"
+_HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
+"""What h5py raises at what it cannot read or has no type for."""
+_RECEIVER_ID: Final = re.compile(r"[A-Za-z0-9_.\-]+")
+_LARGEST_FREQUENCY_HZ: Final = 1e15
 _TRUTH_IDS: Final = ("heliostat_ids", "receiver_ids", "transmitter_ids")
-_TRUTH_DIMENSIONS: Final = {
-    "normal_enu": 3,
-    "receiver_enu_m": 3,
-    "frame_start_index": 1,
-    "transmitter_phase_rad": 3,
-    "clock_ppm": 1,
-    "receiver_delay_s": 2,
-    "tone_snr": 4,
+_TRUTH_AXES: Final[dict[str, tuple[str | int, ...]]] = {
+    "normal_enu": ("frame", "heliostat", 3),
+    "receiver_enu_m": ("frame", "receiver", 3),
+    "frame_start_index": ("frame",),
+    "transmitter_phase_rad": ("frame", "transmitter", "tone"),
+    "clock_ppm": ("receiver",),
+    "receiver_delay_s": ("frame", "receiver"),
+    "tone_snr": ("frame", "receiver", "transmitter", "tone"),
 }
 
 
 class NativeRecording(Recording):
     """An rfpose-iq file. Open it through `open_recording`."""
 
-    def __init__(self, path: Path, *, scenario: Scenario | None = None) -> None:
+    def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         self._file = _open_hdf5(path)
         try:
-            fields = _Fields(path, self._file)
+            fields = _Fields(path, self._file, follow_links=follow_links)
             fields.check_format()
             sample_format = fields.text(keys.SAMPLE_FORMAT)
             if sample_format not in STORED_DTYPE:
                 raise fields.error(keys.SAMPLE_FORMAT, f"must be int16 or complex64, is {sample_format!r}")
-            numerator, denominator = fields.integer(keys.RATE_NUMERATOR), fields.integer(keys.RATE_DENOMINATOR)
-            if numerator < 1 or denominator < 1:
-                raise fields.error(keys.RATE_NUMERATOR, f"gives a rate of {numerator}/{denominator}")
-            receivers = fields.group(keys.RECEIVERS)
             self._iq: dict[str, h5py.Dataset] = {}
             super().__init__(
                 path,
                 format="rfpose-iq",
-                receiver_ids=tuple(receivers),
-                sample_rate=Fraction(numerator, denominator),
-                centre_frequency_hz=fields.optional_number(keys.CENTRE_FREQUENCY),
+                receiver_ids=fields.receiver_ids(),
+                sample_rate=fields.sample_rate(),
+                centre_frequency_hz=fields.centre_frequency(),
                 sample_format=cast(SampleFormat, sample_format),
-                full_scale=fields.number(keys.FULL_SCALE),
+                full_scale=fields.full_scale(),
                 scenario=scenario if scenario is not None else fields.scenario(),
                 truth=fields.truth(),
                 provenance=fields.provenance(),
@@ -67,7 +71,7 @@ class NativeRecording(Recording):
             self._offsets: dict[str, IndexArray] = {}
         except BaseException as error:
             self._file.close()
-            if isinstance(error, OSError | RuntimeError | KeyError | ValueError) and not isinstance(error, RfposeError):
+            if isinstance(error, _HDF5_ERRORS) and not isinstance(error, RfposeError):
                 raise RecordingError(f"{path}: damaged HDF5 file: {error}; copy it again") from error
             raise
 
@@ -76,7 +80,13 @@ class NativeRecording(Recording):
         self._file.close()
 
     def _load_segments(self, receiver_id: str) -> IndexArray:
-        rows = self._fields.blocks(receiver_id, len(self._iq[receiver_id]))
+        try:
+            rows = self._fields.blocks(receiver_id, len(self._iq[receiver_id]))
+        except _HDF5_ERRORS as error:
+            if isinstance(error, RfposeError):
+                raise
+            place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
+            raise RecordingError(f"{self.path}: cannot read `{place}`: {error}; copy the file again") from error
         self._offsets[receiver_id] = rows[:, 2]
         return rows[:, :2]
 
@@ -86,7 +96,7 @@ class NativeRecording(Recording):
         try:
             # the buffer has the file's own compound type, so HDF5 copies bytes and converts nothing
             self._iq[receiver_id].read_direct(target, np.s_[first : first + len(target)])
-        except (OSError, ValueError, RuntimeError) as error:
+        except _HDF5_ERRORS as error:
             raise RecordingError(
                 f"{self.path}: cannot read `/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}` at {first}: {error}; copy the "
                 "file again or check the disk"
@@ -95,6 +105,8 @@ class NativeRecording(Recording):
 
 def _open_hdf5(path: Path) -> h5py.File:
     try:
+        if not path.is_file():  # a pipe or a device has no end and no beginning to go back to
+            raise RecordingError(f"{path}: not a file; give an rfpose-iq file or a directory")
         if path.stat().st_size == 0:
             raise RecordingError(f"{path}: the file is empty; record or simulate again")
         if not h5py.is_hdf5(path):
@@ -120,9 +132,10 @@ def _open_hdf5(path: Path) -> h5py.File:
 class _Fields:
     """Typed access to what is in the file; whatever is missing or mistyped is named."""
 
-    def __init__(self, path: Path, file: h5py.File) -> None:
+    def __init__(self, path: Path, file: h5py.File, *, follow_links: bool) -> None:
         self._path = path
         self._file = file
+        self._follow_links = follow_links
 
     def error(self, place: str, what: str) -> RecordingError:
         """Build the error for an attribute of the root group."""
@@ -140,7 +153,7 @@ class _Fields:
                 "`rfpose info` on it, or give the recording it came from"
             )
         if found != keys.FORMAT_NAME:
-            if "rf_data" in self._file or "digital_rf_version" in self._file.attrs:
+            if self._file.get("rf_data", getlink=True) is not None or "digital_rf_version" in self._file.attrs:
                 raise RecordingError(
                     f"{self._path}: this is one file of a Digital RF recording; give the directory above its channels"
                 )
@@ -178,30 +191,67 @@ class _Fields:
             raise self.error(name, f"of `/` must be a number, is {value!r:.60}")
         return float(value)
 
-    def optional_number(self, name: str) -> float | None:
-        return self.number(name) if name in self._file.attrs else None
+    def sample_rate(self) -> Fraction:
+        """Return the exact rate, checked."""
+        numerator, denominator = self.integer(keys.RATE_NUMERATOR), self.integer(keys.RATE_DENOMINATOR)
+        if numerator < 1 or denominator < 1:
+            raise self.error(keys.RATE_NUMERATOR, f"gives a rate of {numerator}/{denominator}")
+        try:
+            return exact_rate(keys.RATE_NUMERATOR, Fraction(numerator, denominator))
+        except InvalidInputError as error:
+            raise RecordingError(f"{self._path}: attribute {error}; {_REMEDY}") from error
+
+    def centre_frequency(self) -> float | None:
+        """Return the tuning, None where the file does not say."""
+        if keys.CENTRE_FREQUENCY not in self._file.attrs:
+            return None
+        value = self.number(keys.CENTRE_FREQUENCY)
+        if not (math.isfinite(value) and abs(value) <= _LARGEST_FREQUENCY_HZ):
+            raise self.error(keys.CENTRE_FREQUENCY, f"of `/` must be a frequency, is {value:g}")
+        return value
+
+    def full_scale(self) -> float:
+        """Return the largest component, infinite where there is no limit."""
+        value = self.number(keys.FULL_SCALE)
+        if not value > 0.0:
+            raise self.error(keys.FULL_SCALE, f"of `/` must be greater than zero, is {value:g}")
+        return value
 
     # -- groups and datasets -----------------------------------------------------------------------------
 
     def _missing(self, place: str, wanted: str) -> RecordingError:
         return RecordingError(f"{self._path}: `{place}` must be {wanted} and is missing or something else; {_REMEDY}")
 
+    def _holds(self, place: str) -> bool:
+        return find_item(self._file, place, follow_links=self._follow_links) is not None
+
     def group(self, name: str) -> h5py.Group:
-        item = self._file.get(name)
+        item = find_item(self._file, f"/{name}", follow_links=self._follow_links)
         if not isinstance(item, h5py.Group):
             raise self._missing(f"/{name}", "a group")
         return item
 
-    def _dataset(self, place: str, wanted: str) -> h5py.Dataset:
-        item = self._file.get(place)
-        if not isinstance(item, h5py.Dataset):
+    def receiver_ids(self) -> tuple[str, ...]:
+        """Return the receivers in file order."""
+        found = tuple(self.group(keys.RECEIVERS))
+        for name in found:
+            if not _RECEIVER_ID.fullmatch(name):
+                raise RecordingError(
+                    f"{self._path}: `/{keys.RECEIVERS}` holds {printable(name)!r:.60}; a receiver's name may hold "
+                    f"letters, digits, `_`, `-` and `.`; {_REMEDY}"
+                )
+        return found
+
+    def _dataset(self, place: str, wanted: str, *, per_stored: int = FROM_TABLE) -> h5py.Dataset:
+        item = find_dataset(self._file, place, follow_links=self._follow_links, per_stored=per_stored)
+        if item is None or item.shape is None:
             raise self._missing(place, wanted)
         return item
 
     def iq(self, receiver_id: str, dtype: np.dtype[Any]) -> h5py.Dataset:
         """Return a receiver's samples, of exactly the promised type."""
         place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}"
-        dataset = self._dataset(place, "a dataset of samples")
+        dataset = self._dataset(place, "a dataset of samples", per_stored=FROM_SAMPLES)
         if dataset.ndim != 1 or dataset.dtype != dtype:
             raise RecordingError(
                 f"{self._path}: `{place}` must be one-dimensional of type {dtype}, is {dataset.ndim}-dimensional of "
@@ -236,7 +286,7 @@ class _Fields:
 
     def scenario(self) -> Scenario | None:
         """Return the embedded scenario."""
-        if keys.SCENARIO not in self._file:
+        if not self._holds(f"/{keys.SCENARIO}"):
             return None
         return parse_scenario(self._text_dataset(f"/{keys.SCENARIO}"), source=f"{self._path}:/{keys.SCENARIO}")
 
@@ -251,31 +301,45 @@ class _Fields:
 
     def provenance(self) -> dict[str, str]:
         """Return the provenance and the writing program."""
-        found = {keys.CREATED_BY: self.text(keys.CREATED_BY)}
-        if keys.PROVENANCE in self._file:
+        found = {keys.CREATED_BY: printable(self.text(keys.CREATED_BY))}
+        if self._holds(f"/{keys.PROVENANCE}"):
             for name, value in self.group(keys.PROVENANCE).attrs.items():
-                found[str(name)] = str(value)
+                found[printable(str(name))] = printable(str(value))
         return found
 
     def truth(self) -> Truth | None:
         """Return what was simulated, if the file says."""
-        if keys.TRUTH not in self._file:
+        if not self._holds(f"/{keys.TRUTH}"):
             return None
-        group = self.group(keys.TRUTH)
+        self.group(keys.TRUTH)
         found: dict[str, Any] = {name: self._ids(name) for name in _TRUTH_IDS}
         required = {field.name for field in dataclasses.fields(Truth) if field.default is dataclasses.MISSING}
-        for name, n_dimension in _TRUTH_DIMENSIONS.items():
-            if name not in group and name not in required:
-                continue
+        length: dict[str | int, int] = {
+            axis: len(found[f"{axis}_ids"]) for axis in ("heliostat", "receiver", "transmitter")
+        }
+        for name, axes in _TRUTH_AXES.items():
             place = f"/{keys.TRUTH}/{name}"
+            if name not in required and not self._holds(place):
+                continue
             dtype = np.dtype("<i8") if name == "frame_start_index" else np.dtype("<f8")
             dataset = self._dataset(place, f"a dataset of {dtype}")
-            if dataset.dtype != dtype or dataset.ndim != n_dimension:
+            if dataset.dtype != dtype or dataset.ndim != len(axes):
                 raise RecordingError(
-                    f"{self._path}: `{place}` must be {dtype} of {n_dimension} dimensions, is {dataset.dtype} of "
+                    f"{self._path}: `{place}` must be {dtype} of {len(axes)} dimensions, is {dataset.dtype} of "
                     f"shape {dataset.shape}; {_REMEDY}"
                 )
+            wanted = tuple(
+                axis if isinstance(axis, int) else length.setdefault(axis, n)
+                for axis, n in zip(axes, dataset.shape, strict=True)
+            )
+            if dataset.shape != wanted:
+                raise RecordingError(
+                    f"{self._path}: `{place}` must be of shape {wanted} like the others, is {dataset.shape}; {_REMEDY}"
+                )
             found[name] = dataset[()]
+        starts = found.get("frame_start_index")
+        if starts is not None and np.any(starts[1:] <= starts[:-1]):
+            raise RecordingError(f"{self._path}: `/{keys.TRUTH}/frame_start_index` must ascend; {_REMEDY}")
         return Truth(**found)
 
     def _ids(self, name: str) -> tuple[str, ...]:
@@ -283,4 +347,7 @@ class _Fields:
         dataset = self._dataset(place, "a list of texts")
         if dataset.ndim != 1 or h5py.check_string_dtype(dataset.dtype) is None:
             raise self._missing(place, "a list of texts")
-        return tuple(str(item) for item in dataset.asstr()[()])
+        try:
+            return tuple(str(item) for item in dataset.asstr()[()])
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{self._path}: `{place}` is not UTF-8; {_REMEDY}") from error

@@ -14,7 +14,7 @@ __all__ = ["open_recording"]
 _SIGMF_SUFFIXES = (".sigmf-meta", ".sigmf-data")
 
 
-def open_recording(path: str | Path, *, scenario: Scenario | None = None) -> Recording:
+def open_recording(path: str | Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> Recording:
     """Open a recording, whichever of the known formats it has.
 
     Parameters
@@ -25,6 +25,10 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None) -> Rec
     scenario
         The site, in place of the one found in the recording. It is not compared with the recording here; see
         `check_against`.
+    follow_links
+        Read what the recording names outside its own folder, too: links in the file system, SigMF's ``core:dataset``,
+        HDF5's external links, external storage and virtual datasets. A recording from elsewhere could so make any
+        file be read.
 
     Raises
     ------
@@ -38,27 +42,27 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None) -> Rec
     if not path.exists():
         raise RecordingError(f"{path}: no such file or directory; check the path")
     if path.is_dir():
-        return _open_directory(path, scenario)
+        return _open_directory(path, scenario, follow_links=follow_links)
     if path.suffix in _SIGMF_SUFFIXES:
         from rfpose.recording.sigmf_files import SigmfRecording
 
-        return SigmfRecording(path, scenario=scenario)
+        return SigmfRecording(path, scenario=scenario, follow_links=follow_links)
     if path.suffix in (".sigmf", ".sigmf-collection"):
         raise RecordingError(
             f"{path}: a SigMF archive or collection; unpack it (`tar xf`) and give the directory of .sigmf-meta files"
         )
-    return NativeRecording(path, scenario=scenario)
+    return NativeRecording(path, scenario=scenario, follow_links=follow_links)
 
 
-def _open_directory(path: Path, scenario: Scenario | None) -> Recording:
+def _open_directory(path: Path, scenario: Scenario | None, *, follow_links: bool) -> Recording:
     if any(path.glob("*/drf_properties.h5")):
         from rfpose.recording.drf import DigitalRfRecording
 
-        return DigitalRfRecording(path, scenario=scenario)
+        return DigitalRfRecording(path, scenario=scenario, follow_links=follow_links)
     if any(path.glob("*.sigmf-meta")):
         from rfpose.recording.sigmf_files import SigmfRecording
 
-        return SigmfRecording(path, scenario=scenario)
+        return SigmfRecording(path, scenario=scenario, follow_links=follow_links)
     if (path / "drf_properties.h5").exists():
         raise RecordingError(f"{path}: this is one channel of a Digital RF recording; give `{path.parent}` instead")
     raise RecordingError(

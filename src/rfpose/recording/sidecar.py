@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from rfpose.recording.links import refuse_outside
 from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["SCENARIO_FILE", "load_sidecar_scenario"]
@@ -12,13 +13,21 @@ __all__ = ["SCENARIO_FILE", "load_sidecar_scenario"]
 SCENARIO_FILE: Final = "scenario.toml"
 
 
-def load_sidecar_scenario(directory: Path) -> Scenario | None:
+def load_sidecar_scenario(directory: Path, *, follow_links: bool) -> Scenario | None:
     """Return the scenario of a Digital RF or SigMF directory, or None if it holds none.
+
+    A link that leads out of the directory is followed only with ``follow_links``.
 
     Raises
     ------
+    RecordingError
+        The file lies outside ``directory``.
     ScenarioError
         The file is malformed.
     """
     path = directory / SCENARIO_FILE
-    return load_scenario(path) if path.is_file() else None
+    if not path.is_file():
+        return None
+    if not follow_links:
+        refuse_outside(directory, path, named_by=path)
+    return load_scenario(path)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import re
 import warnings
-from collections.abc import Iterator
-from datetime import UTC, datetime
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
-from rfpose.errors import RecordingError
-from rfpose.recording.base import IndexArray, IqArray, Recording, SampleFormat
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.foreign import exact_number, exact_rate, load_json
+from rfpose.recording.base import COMPONENT_DTYPE, IndexArray, IqArray, Recording, SampleFormat
+from rfpose.recording.links import FOLLOW, refuse_outside
 from rfpose.recording.sidecar import load_sidecar_scenario
+from rfpose.recording.stamps import LARGEST_INDEX, Capture, parse_stamp, place_captures
 from rfpose.scenario import Scenario
 
 __all__ = ["DATATYPES", "META_SUFFIX", "SigmfRecording", "import_sigmf"]
@@ -26,10 +24,9 @@ META_SUFFIX: Final = ".sigmf-meta"
 DATATYPES: Final[dict[SampleFormat, str]] = {"int16": "ci16_le", "complex64": "cf32_le"}
 """What is written; big-endian twins are read as well."""
 
-_LARGEST_DENOMINATOR = 1_000_000
-"""A SigMF sample rate is a decimal number; the nearest simple fraction is taken, as for a scenario's."""
-_DATETIME = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d+))?Z")
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_CAPTURES_VALIDATED: Final = 100
+_SINCE_S: Final = 10**8
+"""An index without a time stamp that would lie before 1973 counts from something else than the epoch."""
 
 
 def import_sigmf() -> Any:
@@ -54,23 +51,25 @@ class _Stream(NamedTuple):
     segments: IndexArray
     """(segment, 3) rows [start index, count, offset in the data file]."""
     about: dict[str, str]
+    doubts: list[str]
+    time_known: bool
 
 
 class SigmfRecording(Recording):
     """A directory of SigMF recordings, or a single one. Open it through `open_recording`.
 
-    The receiver is named as the file is. A capture's time is its ``core:datetime``; where that agrees with
-    ``core:global_index`` to a second, the latter is exact and is taken. Later captures of a file continue by
-    ``core:global_index`` if they have it, else by their own time, else without a gap.
+    The receiver is named as the file is. On how time is found see `place_captures`.
     """
 
-    def __init__(self, path: Path, *, scenario: Scenario | None = None) -> None:
+    def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         library = import_sigmf()
         if path.is_dir():
             metas = sorted(path.glob(f"*{META_SUFFIX}"))
         else:
             metas = [path.with_suffix(META_SUFFIX)]
-        self._streams = {meta.name.removesuffix(META_SUFFIX): _load(library, meta) for meta in metas}
+        self._streams = {
+            meta.name.removesuffix(META_SUFFIX): _load(library, meta, follow_links=follow_links) for meta in metas
+        }
         first = next(iter(self._streams.values()))
         for receiver_id, stream in self._streams.items():
             for what in ("rate", "sample_format", "centre_frequency_hz"):
@@ -88,9 +87,13 @@ class SigmfRecording(Recording):
             centre_frequency_hz=first.centre_frequency_hz,
             sample_format=first.sample_format,
             full_scale=32767.0 if first.sample_format == "int16" else math.inf,
-            scenario=scenario if scenario is not None else load_sidecar_scenario(metas[0].parent),
+            scenario=scenario
+            if scenario is not None
+            else load_sidecar_scenario(metas[0].parent, follow_links=follow_links),
             provenance=first.about,
         )
+        self.doubts = {name: stream.doubts for name, stream in self._streams.items() if stream.doubts}
+        self.time_known = all(stream.time_known for stream in self._streams.values())
 
     def close(self) -> None:
         """Close the data files."""
@@ -122,112 +125,153 @@ class SigmfRecording(Recording):
             out.byteswap(inplace=True)
 
 
-def _load(library: Any, meta: Path) -> _Stream:
-    with _library_errors(meta):
-        json.loads(meta.read_text(encoding="utf-8"))  # the library leaves the file open where this fails
-        file = library.sigmffile.fromfile(meta, skip_checksum=True, autoscale=False)
-        file.validate()
-        found = file.get_global_info()
+def _load(library: Any, meta: Path, *, follow_links: bool) -> _Stream:
+    if not follow_links:
+        refuse_outside(meta.parent, meta, named_by=meta)
+    content = load_json(meta)
+    try:
+        _check_schema(library, content)
+        return _stream(meta, content, follow_links=follow_links)
+    except InvalidInputError as error:
+        raise RecordingError(f"{meta}: {error}; correct the file") from error
+
+
+def _check_schema(library: Any, content: Any) -> None:
+    """Let the library check names and types; annotations are not used, and captures beyond the first are alike."""
+    from jsonschema.exceptions import ValidationError  # type: ignore[import-untyped]  # comes with sigmf
+
+    if not isinstance(content, dict):
+        raise InvalidInputError(f"must hold one JSON object, got {type(content).__name__}")
+    found = {name: content.get(name, {} if name == "global" else []) for name in ("global", "captures", "annotations")}
+    for name, kind in (("global", dict), ("captures", list)):
+        if not isinstance(found[name], kind):
+            raise InvalidInputError(f"`{name}` must be a JSON {kind.__name__}, got {found[name]!r:.60}")
+    general = {key: value for key, value in found["global"].items() if key != "core:dataset"}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what it would rather see is no fault of the samples
+            library.validate.validate(
+                {"global": general, "captures": found["captures"][:_CAPTURES_VALIDATED], "annotations": []}
+            )
+    except ValidationError as error:
+        place = ".".join(str(part) for part in error.absolute_path)
+        what = str(error.message).splitlines()[0]
+        raise InvalidInputError(f"cannot read: {f'`{place}`: ' if place else ''}{what:.200}") from error
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidInputError(f"cannot read: no SigMF metadata ({type(error).__name__}: {error})"[:200]) from error
+
+
+def _stream(meta: Path, content: dict[str, Any], *, follow_links: bool) -> _Stream:
+    found = content["global"]
     datatype = str(found["core:datatype"])
     sample_format = next((name for name, known in DATATYPES.items() if datatype[:4] == known[:4]), None)
     if sample_format is None:
-        raise RecordingError(
-            f"{meta}: `core:datatype` is {datatype}; rfpose reads ci16 and cf32: convert the recording to one of them"
+        raise InvalidInputError(
+            f"`core:datatype` is {datatype:.20}; rfpose reads ci16 and cf32: convert the recording to one of them"
         )
-    if file.data_file is None:
-        raise RecordingError(f"{meta}: the file of samples beside it is missing; copy it there")
-    captures = file.get_captures() or [{"core:sample_start": 0}]
     for name in ("core:offset", "core:trailing_bytes"):
         if found.get(name, 0):
-            raise RecordingError(f"{meta}: `{name}` is not supported; write the recording as one conforming dataset")
+            raise InvalidInputError(f"`{name}` is not supported; write the recording as one conforming dataset")
+    captures = content.get("captures") or [{"core:sample_start": 0}]
     if found.get("core:num_channels", 1) != 1 or any(capture.get("core:header_bytes", 0) for capture in captures):
-        raise RecordingError(
-            f"{meta}: interleaved channels and headers within the samples are not supported; write one conforming "
-            "dataset a receiver"
+        raise InvalidInputError(
+            "interleaved channels and headers within the samples are not supported; write one conforming dataset a "
+            "receiver"
         )
-    if not isinstance(found.get("core:sample_rate"), int | float):
-        raise RecordingError(f"{meta}: `core:sample_rate` is missing; add it")
-    rate = Fraction(found["core:sample_rate"]).limit_denominator(_LARGEST_DENOMINATOR)
-    tunings = {capture.get("core:frequency") for capture in captures}
-    if len(tunings) > 1:
+    if "core:sample_rate" not in found:
+        raise InvalidInputError("`core:sample_rate` is missing; add it")
+    rate = exact_rate("core:sample_rate", found["core:sample_rate"])
+    data = _data_file(meta, found.get("core:dataset"), follow_links=follow_links)
+    n_sample, rest = divmod(data.stat().st_size, 2 * COMPONENT_DTYPE[sample_format].itemsize)
+    if rest:
         raise RecordingError(
-            f"{meta}: the captures have different `core:frequency`: {sorted(map(str, tunings))}; split the recording"
+            f"{data}: does not hold an integer number of samples of {datatype}: {rest} bytes are left; copy it again"
         )
-    tuning = tunings.pop()
-    about = {name: str(found[name]) for name in ("core:recorder", "core:hw", "core:description") if name in found}
+    segments, doubts, time_known = _segments(captures, n_sample, rate)
     return _Stream(
-        data=Path(file.data_file),
+        data=data,
         rate=rate,
         sample_format=sample_format,
         big_endian=datatype.endswith("_be"),
-        centre_frequency_hz=None if tuning is None else float(tuning),
-        segments=_segments(meta, captures, int(file.sample_count), rate),
-        about=about,
+        centre_frequency_hz=_tuning(captures),
+        segments=segments,
+        about={name: str(found[name]) for name in ("core:recorder", "core:hw", "core:description") if name in found},
+        doubts=doubts,
+        time_known=time_known,
     )
 
 
-def _segments(meta: Path, captures: list[dict[str, Any]], n_sample: int, rate: Fraction) -> IndexArray:
-    """Return (segment, 3) rows [start index, count, offset]; see `SigmfRecording` on how time is found."""
-    offsets = [int(capture["core:sample_start"]) for capture in captures]
-    if offsets[-1] > n_sample:
-        raise RecordingError(
-            f"{meta}: capture {len(captures) - 1} starts at sample {offsets[-1]} of {n_sample}; the file of samples "
-            "is truncated: copy it again"
-        )
-    first = captures[0]
-    global_first = first.get("core:global_index")
-    start = _index_of_datetime(meta, first, rate)
-    if start is None or (global_first is not None and abs(global_first - start[0]) <= rate):
-        reached = int(global_first or 0)
-    else:
-        reached = start[0]
-    anchor = reached
-    rows = []
-    for i, capture in enumerate(captures):
-        count = (offsets[i + 1] if i + 1 < len(offsets) else n_sample) - offsets[i]
-        begin = reached
-        if i > 0 and global_first is not None and "core:global_index" in capture:
-            begin = anchor + int(capture["core:global_index"]) - int(global_first)
-        elif i > 0 and (found := _index_of_datetime(meta, capture, rate)) is not None:
-            begin, uncertainty = found
-            if abs(begin - reached) <= uncertainty:  # the time stamp is too coarse to tell a gap
-                begin = reached
-        if begin < reached:
+def _data_file(meta: Path, named: Any, *, follow_links: bool) -> Path:
+    """Return the file of samples, which stands beside the metadata."""
+    data = meta.with_suffix(".sigmf-data")
+    if named is not None:
+        if not isinstance(named, str) or not named or "\0" in named:
+            raise InvalidInputError(f"`core:dataset` must be a file name, got {named!r:.60}")
+        data = meta.parent / named
+        if not follow_links and data.name != named:
             raise RecordingError(
-                f"{meta}: capture {i} starts {reached - begin} samples before capture {i - 1} ends; correct its "
-                "`core:datetime` or `core:global_index`"
+                f"{meta}: `core:dataset` names {named!r:.200}, which is not a file beside it and is not read; {FOLLOW}"
             )
-        if count > 0:
-            rows.append((begin, count, offsets[i]))
-        reached = begin + count
-    return np.array(rows, np.int64).reshape(-1, 3)
+    if not follow_links:
+        refuse_outside(meta.parent, data, named_by=meta)
+    if not data.is_file():
+        raise RecordingError(f"{meta}: the file of samples beside it is missing: `{data.name}`; copy it there")
+    return data
 
 
-def _index_of_datetime(meta: Path, capture: dict[str, Any], rate: Fraction) -> tuple[int, int] | None:
-    """Return the sample index at a capture's time stamp, and how many samples its last digit is."""
-    text = capture.get("core:datetime")
-    if text is None:
-        return None
-    match = _DATETIME.fullmatch(text)
-    if match is None:
-        raise RecordingError(f"{meta}: `core:datetime` is {text!r}; it must look like 2026-09-21T14:00:00.123Z")
-    whole = datetime.fromisoformat(match[1]).replace(tzinfo=UTC) - _EPOCH
-    digits = match[2] or ""
-    resolution = Fraction(1, 10 ** len(digits))
-    seconds = whole.days * 86400 + whole.seconds + int(digits or "0") * resolution
-    return round(seconds * rate), math.ceil(resolution * rate)
+def _tuning(captures: list[dict[str, Any]]) -> float | None:
+    tunings = {capture.get("core:frequency") for capture in captures}
+    if len(tunings) > 1:
+        shown = ", ".join(sorted(map(str, tunings))[:4])
+        raise InvalidInputError(f"the captures have different `core:frequency`: {shown}; split the recording")
+    tuning = tunings.pop()
+    return None if tuning is None else float(exact_number("core:frequency", tuning))
 
 
-@contextlib.contextmanager
-def _library_errors(meta: Path) -> Iterator[None]:
-    """Turn what the library raises or warns of into one line."""
-    from jsonschema.exceptions import ValidationError  # type: ignore[import-untyped]  # comes with sigmf
+def _segments(captures: list[dict[str, Any]], n_sample: int, rate: Fraction) -> tuple[IndexArray, list[str], bool]:
+    """Return (segment, 3) rows [start index, count, offset], what is doubtful, and whether the time is known."""
+    found = [_capture(i, capture, rate) for i, capture in enumerate(captures)]
+    ends = [c.first_sample for c in found[1:]] + [n_sample]
+    for i, (capture, end) in enumerate(zip(found, ends, strict=True)):
+        if capture.first_sample > n_sample:
+            raise InvalidInputError(
+                f"capture {i} starts at sample {capture.first_sample} of {n_sample}; the file of samples is truncated: "
+                "copy it again"
+            )
+        if end < capture.first_sample:
+            raise InvalidInputError(f"capture {i + 1} has a `core:sample_start` before that of capture {i}")
+    timing = place_captures(found, rate)
+    for i, start in enumerate(timing.start_index):
+        if not 0 <= start < LARGEST_INDEX:
+            raise InvalidInputError(f"capture {i} starts at sample {start} since 1970, more than 64 bits can count")
+    rows = [
+        (start, end - capture.first_sample, capture.first_sample)
+        for start, capture, end in zip(timing.start_index, found, ends, strict=True)
+        if end > capture.first_sample
+    ]
+    doubts = timing.doubts
+    time_known = found[0].stamp is not None or (found[0].global_index or 0) >= rate * _SINCE_S
+    if not time_known:
+        what = "no `core:datetime`" if found[0].global_index is not None else "neither `core:datetime` nor an index"
+        doubts = [
+            f"its metadata has {what}: when it was recorded is not known, nor how it lies to the other receivers",
+            *doubts,
+        ]
+    return np.array(rows, np.int64).reshape(-1, 3), doubts, time_known
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", UserWarning)
-            yield
-    except json.JSONDecodeError as error:
-        raise RecordingError(f"{meta}: not valid JSON: {error}; copy the file again") from error
-    except (OSError, ValueError, KeyError, TypeError, UserWarning, RuntimeError, ValidationError) as error:
-        raise RecordingError(f"{meta}: cannot read: {str(error).splitlines()[0]}; correct or copy it again") from error
+
+def _capture(i: int, capture: dict[str, Any], rate: Fraction) -> Capture:
+    """Check what is used of a capture."""
+    if not isinstance(capture, dict):
+        raise InvalidInputError(f"capture {i} must be a JSON object, got {capture!r:.60}")
+    counts = []
+    for name in ("core:sample_start", "core:global_index"):
+        value = capture.get(name)
+        if (value is None and name == "core:sample_start") or isinstance(value, bool):
+            raise InvalidInputError(f"capture {i}: `{name}` must be a whole number, got {value!r}")
+        exact = None if value is None else exact_number(name, value)
+        if exact is not None and (exact.denominator != 1 or not 0 <= exact < LARGEST_INDEX):
+            raise InvalidInputError(f"capture {i}: `{name}` must be a whole number below 2^62, got {value!r:.40}")
+        counts.append(None if exact is None else int(exact))
+    stamp = None if capture.get("core:datetime") is None else parse_stamp(capture["core:datetime"], rate)
+    return Capture(first_sample=counts[0] or 0, stamp=stamp, global_index=counts[1])

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
-from rfpose.errors import RecordingError, ScenarioError
-from rfpose.recording.base import Recording, count_fill, frame_starts, recorded_runs
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.recording.base import IndexArray, Recording, count_fill, frame_starts, own_frames, recorded_runs
+from rfpose.recording.stamps import stamp_text
 from rfpose.scenario import Scenario
 
-__all__ = ["check_against", "describe"]
+__all__ = ["check_against", "describe", "note_doubts"]
+
+_log = logging.getLogger(__name__)
 
 _SAMPLES_LOOKED_AT = 2**20
 """A receiver, at most, in `_PIECES` pieces spread over what it recorded."""
 _PIECES = 16
+_RUN_PER_EDGE = 4
+"""A receiver that began or ended within this part of a stretch beside the others did not lose samples there."""
 _RATE_TOLERANCE = 1e-9
 """Relative; a scenario gives its rate as a decimal number."""
 _CLIPPED_FRACTION = 1e-5
@@ -56,6 +63,14 @@ def _disagreements(recording: Recording, scenario: Scenario) -> list[str]:
     return found
 
 
+def note_doubts(recording: Recording) -> None:
+    """Log what a recording says of itself that cannot be right, or does not say and should; one line each."""
+    problems = _Problems()
+    problems.of_doubts(recording)
+    for line in problems.lines():
+        _log.warning("%s: %s", recording.path, line)
+
+
 def describe(recording: Recording) -> dict[str, Any]:
     """Summarise a recording and judge whether it is sound.
 
@@ -66,15 +81,30 @@ def describe(recording: Recording) -> dict[str, Any]:
     dict
         Ready for JSON: numbers, text, lists, None; no NaN or infinity. ``sound`` is true when ``problems``,
         a list of one-line texts, is empty. Levels are relative to full scale [dB], None where there is none.
+        ``lost_samples`` are those that a receiver missed while others recorded; a pause of all is none.
     """
-    problems: list[str] = []
-    receivers = {}
+    problems = _Problems()
+    readable = []
     for receiver_id in recording.receiver_ids:
         try:
-            receivers[receiver_id] = _describe_receiver(recording, receiver_id, problems)
+            recording.blocks(receiver_id)
+            readable.append(receiver_id)
         except RecordingError as error:
-            problems.append(f"{receiver_id}: {error}")
-            receivers[receiver_id] = {"readable": False}
+            problems.of(receiver_id, str(error))
+    all_readable = len(readable) == len(recording.receiver_ids)
+    runs = recorded_runs(recording, readable)
+    starts = None
+    if recording.scenario is not None and all_readable:
+        starts = frame_starts(recording, recording.scenario.radio.frame_samples)
+    receivers: dict[str, dict[str, Any]] = {}
+    for receiver_id in recording.receiver_ids:
+        receivers[receiver_id] = {"readable": False}
+        try:
+            if receiver_id in readable:
+                receivers[receiver_id] = _describe_receiver(recording, receiver_id, runs, starts, problems)
+        except RecordingError as error:
+            problems.of(receiver_id, str(error))
+    problems.of_doubts(recording)
     scenario = recording.scenario
     summary: dict[str, Any] = {
         "path": str(recording.path),
@@ -89,54 +119,128 @@ def describe(recording: Recording) -> dict[str, Any]:
         "has_truth": recording.truth is not None,
         "provenance": recording.provenance,
     }
-    summary |= _describe_time(recording, receivers, problems)
+    summary |= _describe_time(recording, runs, starts, problems, all_readable=all_readable)
+    found = problems.lines()
     if scenario is not None:
-        problems += _disagreements(recording, scenario)
+        found += _disagreements(recording, scenario)
         missing = [name for name in scenario.receiver_ids if name not in recording.receiver_ids]
         if missing:
-            problems.append(f"{len(missing)} receivers of the scenario are not in the recording: {_some(missing)}")
+            found.append(f"{len(missing)} receivers of the scenario are not in the recording: {_some(missing)}")
         summary["receivers_not_in_scenario"] = [
             name for name in recording.receiver_ids if name not in scenario.receiver_ids
         ]
-    summary["problems"] = problems
-    summary["sound"] = not problems
+    summary["problems"] = found
+    summary["sound"] = not found
     return summary
 
 
-def _describe_time(recording: Recording, receivers: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    if not all(entry.get("readable") for entry in receivers.values()):
-        return {"start_unix_s": None, "span_s": None, "recorded_s": None, "stretches": None, "frames": None}
-    runs = recorded_runs(recording)
+class _Problems:
+    """Collects problems; what several receivers share is one line."""
+
+    def __init__(self) -> None:
+        self._receivers: dict[str, list[str]] = {}
+
+    def of(self, receiver_id: str, text: str) -> None:
+        """Add a problem of one receiver."""
+        self._receivers.setdefault(text, []).append(receiver_id)
+
+    def of_doubts(self, recording: Recording) -> None:
+        """Add what a recording itself doubts."""
+        for receiver_id, doubts in recording.doubts.items():
+            for doubt in doubts:
+                self.of(receiver_id, doubt)
+
+    def add(self, text: str) -> None:
+        """Add a problem of the whole recording."""
+        self._receivers.setdefault(text, [])
+
+    def lines(self) -> list[str]:
+        """Return one line a problem."""
+        return [
+            text
+            if not names
+            else f"{names[0] if len(names) == 1 else f'{len(names)} receivers ({_some(names)})'}: {text}"
+            for text, names in self._receivers.items()
+        ]
+
+
+def _describe_time(
+    recording: Recording, runs: IndexArray, starts: IndexArray | None, problems: _Problems, *, all_readable: bool
+) -> dict[str, Any]:
+    about: dict[str, Any] = dict.fromkeys(
+        ("start_index", "start_unix_s", "start_utc", "end_utc", "span_s", "recorded_s", "stretches", "frames")
+    )
+    if not all_readable:
+        return about
     if len(runs) == 0:
-        problems.append("no samples were recorded")
-        return {"start_unix_s": None, "span_s": 0.0, "recorded_s": 0.0, "stretches": 0, "frames": 0}
-    first, end = int(runs[0, 0]), int(runs[-1].sum())
-    frames = None
-    if recording.scenario is not None:
-        frame_samples = recording.scenario.radio.frame_samples
-        frames = len(frame_starts(recording, frame_samples))
-        if frames == 0:
-            problems.append(f"no stretch is as long as a frame of {frame_samples} samples")
-    return {
-        "start_unix_s": float(first / recording.sample_rate),
-        "span_s": float((end - first) / recording.sample_rate),
-        "recorded_s": float(int(runs[:, 1].sum()) / recording.sample_rate),
+        problems.add("no samples were recorded")
+        return about | {"span_s": 0.0, "recorded_s": 0.0, "stretches": 0, "frames": 0}
+    rate, first, end = recording.sample_rate, int(runs[0, 0]), int(runs[-1].sum())
+    about |= {
+        "span_s": float((end - first) / rate),
+        "recorded_s": float(int(runs[:, 1].sum()) / rate),
         "stretches": len(runs),
-        "frames": frames,
+        "frames": None if starts is None else len(starts),
     }
+    if recording.time_known:
+        about |= {
+            "start_index": first,
+            "start_unix_s": float(first / rate),
+            "start_utc": _utc(first, rate),
+            "end_utc": _utc(end, rate),
+        }
+    if starts is not None and len(starts) == 0 and recording.scenario is not None:
+        problems.add(f"no stretch is as long as a frame of {recording.scenario.radio.frame_samples} samples")
+    return about
 
 
-def _describe_receiver(recording: Recording, receiver_id: str, problems: list[str]) -> dict[str, Any]:
+def _utc(index: int, rate: Fraction) -> str | None:
+    """Return a sample's time to the nanosecond, None beyond the calendar."""
+    try:
+        return f"{stamp_text(index, rate)[:-4]}Z"
+    except InvalidInputError:
+        return None
+
+
+def _lost(blocks: IndexArray, runs: IndexArray) -> int:
+    """Count the samples that a receiver missed while others recorded.
+
+    That it started or stopped a little beside the others in a stretch is no loss. A receiver alone has nobody who
+    recorded meanwhile, so its own gaps are losses.
+    """
+    if len(blocks) == 0:
+        return int(runs[:, 1].sum())
+    gap = blocks[1:, 0] - blocks[:-1].sum(axis=1)
+    i_run = np.searchsorted(runs[:, 0], blocks[:, 0], side="right") - 1
+    lost = int(gap[i_run[1:] == i_run[:-1]].sum())
+    present, first = np.unique(i_run, return_index=True)
+    last = np.append(first[1:], len(blocks)) - 1
+    missed = np.setdiff1d(np.arange(len(runs)), present)
+    lost += int(runs[missed, 1].sum())
+    for edge in (blocks[first, 0] - runs[present, 0], runs[present].sum(axis=1) - blocks[last].sum(axis=1)):
+        lost += int(edge[edge > runs[present, 1] // _RUN_PER_EDGE].sum())
+    return lost
+
+
+def _describe_receiver(
+    recording: Recording, receiver_id: str, runs: IndexArray, starts: IndexArray | None, problems: _Problems
+) -> dict[str, Any]:
     blocks = recording.blocks(receiver_id)
     n_recorded = int(blocks[:, 1].sum())
     entry: dict[str, Any] = {"readable": True, "samples": n_recorded, "blocks": len(blocks)}
-    entry["lost_samples"] = int(blocks[-1].sum() - blocks[0, 0]) - n_recorded if len(blocks) else 0
+    if len(recording.receiver_ids) == 1:
+        entry["lost_samples"] = int(blocks[-1].sum() - blocks[0, 0]) - n_recorded if len(blocks) else 0
+    else:
+        entry["lost_samples"] = _lost(blocks, runs)
+    if recording.scenario is not None and starts is not None:
+        entry["frames"] = _count_frames(blocks, starts, recording.scenario.radio.frame_samples, receiver_id, problems)
     if n_recorded == 0:
-        problems.append(f"{receiver_id}: no samples")
+        problems.of(receiver_id, "no samples")
         return entry
     sample = _look_at(recording, receiver_id)
     n_fill = count_fill(sample)
-    values = sample.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is counted, not warned of
+        values = sample.astype(np.float64)
     bad = ~np.isfinite(values)
     magnitude = np.abs(values[~bad])
     full_scale = recording.full_scale
@@ -152,14 +256,29 @@ def _describe_receiver(recording: Recording, receiver_id: str, problems: list[st
         "non_finite_values": int(bad.sum()) - (2 * n_fill if sample.dtype.kind == "f" else 0),
     }
     if n_fill:
-        problems.append(f"{receiver_id}: {n_fill} of {len(sample)} samples looked at hold the fill value: lost samples")
+        problems.of(receiver_id, f"{n_fill} of {len(sample)} samples looked at hold the fill value: lost samples")
     if entry["non_finite_values"]:
-        problems.append(f"{receiver_id}: {entry['non_finite_values']} of {values.size} values looked at are NaN or Inf")
+        problems.of(receiver_id, f"{entry['non_finite_values']} of {values.size} values looked at are NaN or Inf")
     if rms == 0.0:
-        problems.append(f"{receiver_id}: all samples looked at are zero: is the receiver connected?")
+        problems.of(receiver_id, "all samples looked at are zero: is the receiver connected?")
     if clipped > _CLIPPED_FRACTION:
-        problems.append(f"{receiver_id}: {100.0 * clipped:.3g} % of the values looked at are clipped: reduce the gain")
+        problems.of(receiver_id, f"{100.0 * clipped:.3g} % of the values looked at are clipped: reduce the gain")
     return entry
+
+
+def _count_frames(
+    blocks: IndexArray, starts: IndexArray, frame_samples: int, receiver_id: str, problems: _Problems
+) -> int:
+    """Count a receiver's frames; one that has enough samples, but beside the others', is a problem."""
+    n_frame = int(np.count_nonzero(own_frames(blocks, starts, frame_samples) >= 0))
+    possible = int((blocks[:, 1] // frame_samples).sum())
+    if possible > 2 * n_frame:
+        problems.of(
+            receiver_id,
+            f"recorded {possible} frames of {frame_samples} samples, but lies so far beside the others that {n_frame} "
+            "of them are in common; set the receivers' starts closer together, or shorten `radio.frame_samples`",
+        )
+    return n_frame
 
 
 def _look_at(recording: Recording, receiver_id: str) -> np.ndarray[Any, Any]:

@@ -147,6 +147,7 @@ def run(
     scenario_path: Path | None = None,
     theme: str | None = None,
     size: tuple[int, int] | None = None,
+    follow_links: bool = False,
 ) -> int:
     """Open the window and return its exit code when it is closed.
 
@@ -171,5 +172,5 @@ def run(
         window.resize(*size)
     window.show()
     if path is not None:
-        window.open_path(path, scenario_path=scenario_path)
+        window.open_path(path, scenario_path=scenario_path, follow_links=follow_links)
     return int(app.exec())

@@ -99,7 +99,12 @@ def settle(app: QApplication, window: MainWindow, *, timeout_s: float = _TIMEOUT
 
 
 def open_window(
-    path: Path, *, scenario_path: Path | None = None, theme: str = "light", size: tuple[int, int] = (1280, 800)
+    path: Path,
+    *,
+    scenario_path: Path | None = None,
+    follow_links: bool = False,
+    theme: str = "light",
+    size: tuple[int, int] = (1280, 800),
 ) -> tuple[QApplication, MainWindow]:
     """Open a file in a window that nobody sees; the user's settings are neither read nor changed.
 
@@ -121,7 +126,7 @@ def open_window(
     from rfpose.viewer.state.settings import Settings
     from rfpose.viewer.window import MainWindow
 
-    document = open_document(path, scenario_path=scenario_path)
+    document = open_document(path, scenario_path=scenario_path, follow_links=follow_links)
     with tempfile.TemporaryDirectory() as folder:
         preferences = Preferences(QSettings(str(Path(folder) / "viewer.ini"), QSettings.Format.IniFormat))
         preferences.save(Settings(theme=theme))
@@ -139,6 +144,7 @@ def export(
     *,
     view: str | None = None,
     scenario_path: Path | None = None,
+    follow_links: bool = False,
     theme: str = "light",
     size: tuple[int, int] = (1280, 800),
     heliostat: str | None = None,
@@ -165,7 +171,7 @@ def export(
     """
     if output.suffix not in FORMATS:
         raise InvalidInputError(f"{output}: a picture must end in {', '.join(FORMATS)}")
-    app, window = open_window(path, scenario_path=scenario_path, theme=theme, size=size)
+    app, window = open_window(path, scenario_path=scenario_path, follow_links=follow_links, theme=theme, size=size)
     try:
         _select(window, heliostat=heliostat, transmitter=transmitter, frame=frame)
         if output.suffix == ".html":

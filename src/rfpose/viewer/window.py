@@ -81,6 +81,7 @@ class MainWindow(QMainWindow):
         self.workers = Workers(self.fail, self)
         self.views: dict[str, View] = {}
         self._opening: str | None = None
+        self._follow_links = False
         self._disconnect: list[Callable[[], None]] = [
             self.session.opened.connect(self._on_opened),
             self.session.said.connect(self._show_message),
@@ -212,14 +213,17 @@ class MainWindow(QMainWindow):
 
     # -- files -------------------------------------------------------------------------------------------
 
-    def open_path(self, path: str | Path, *, scenario_path: str | Path | None = None) -> None:
+    def open_path(
+        self, path: str | Path, *, scenario_path: str | Path | None = None, follow_links: bool = False
+    ) -> None:
         """Open a file in the background; what goes wrong becomes a message."""
         path = Path(path)
         self._opening = str(path)
+        self._follow_links = follow_links
         self.workers.cancel()
         self.workers.run(
             "Opening",
-            lambda _: open_document(path, scenario_path=scenario_path),
+            lambda _: open_document(path, scenario_path=scenario_path, follow_links=follow_links),
             self._opened,
             failed=self._open_failed,
         )
@@ -260,7 +264,9 @@ class MainWindow(QMainWindow):
             self.go_to(current)
 
         self.workers.cancel()
-        self.workers.run("Opening", lambda _: open_document(path), again, failed=self._open_failed)
+        self.workers.run(
+            "Opening", lambda _: open_document(path, follow_links=self._follow_links), again, failed=self._open_failed
+        )
 
     def open_example(self) -> None:
         """Open the site that comes with rfpose."""

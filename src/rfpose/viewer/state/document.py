@@ -73,7 +73,7 @@ class Document:
             self.recording.close()
 
 
-def open_document(path: str | Path, *, scenario_path: str | Path | None = None) -> Document:
+def open_document(path: str | Path, *, scenario_path: str | Path | None = None, follow_links: bool = False) -> Document:
     """Open whatever of ours a path holds.
 
     Parameters
@@ -82,6 +82,8 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None) 
         A scenario (.toml), a result, a tracking run, or a recording in any format.
     scenario_path
         Site of a recording that brings none; wins over its own.
+    follow_links
+        As for `rfpose.recording.open_recording`.
 
     Raises
     ------
@@ -107,7 +109,7 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None) 
             frame_start_index=_none(),
         )
     given = None if scenario_path is None else load_scenario(scenario_path)
-    return _recording(SharedRecording(open_recording(path, scenario=given)))
+    return _recording(SharedRecording(open_recording(path, scenario=given, follow_links=follow_links)))
 
 
 def _none() -> npt.NDArray[np.int64]:
