@@ -59,14 +59,10 @@ def command(
     """
     if dish == (target is not None):
         raise click.UsageError("give either --target E N U, or --dish")
-    from rfpose.feedback.sun import Site
+    from rfpose.feedback.sun import site_from_degrees
     from rfpose.pipeline.aim import plan_commands, write_commands
 
-    place = (
-        None
-        if site is None
-        else Site(latitude_rad=math.radians(site[0]), longitude_rad=math.radians(site[1]), altitude_m=site[2])
-    )
+    place = None if site is None else site_from_degrees(*site)
     plans = plan_commands(
         model,
         target_enu_m=target,
@@ -106,6 +102,8 @@ def _show(plan: Plan) -> None:
     if not plan.calibrated:
         say("  as planned, not calibrated: nothing is known of its errors")
         return
+    if plan.noise_assumed:
+        say("  the noise is assumed, not measured: the calibration had too few redundant measurements to tell it")
     text = ", ".join(f"{name} {_number(value)}" for name, value in zip(_MONTHS, told["month_sigma_mrad"], strict=True))
     say(f"  open over the year, on the 21st [mrad of the normal]: {text}")
     for item in told["next"]:

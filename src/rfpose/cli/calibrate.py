@@ -11,7 +11,7 @@ import click
 from rfpose.cli._support import common_options, emit_json, examples, force_option, say, table, wants_json
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.calibrate import HeliostatReport
+    from rfpose.pipeline.calibrate import Calibrations
 
 __all__ = ["command"]
 
@@ -38,7 +38,16 @@ _SHOWN_ALARMS = 12
 @click.option(
     "--parameters",
     metavar="SET",
-    help="Free parameters: a set's name, or names with commas between. Default: level-full for PAINT, else edwards-4.",
+    default="auto",
+    show_default=True,
+    help="Free parameters: auto (as many as the records carry), a set's name, or names with commas between.",
+)
+@click.option(
+    "--algorithm",
+    type=click.Choice(("both", "any", "HeliOS", "UTIS")),
+    default="both",
+    show_default=True,
+    help="Focal spot of PAINT records: mean of both, of what there is, or one; records without it are left out.",
 )
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="Write the models: .json or .toml.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the errors: .png, .pdf, .svg.")
@@ -52,7 +61,8 @@ def command(
     camera: Path | None,
     drone: Path | None,
     heliostats: tuple[str, ...],
-    parameters: str | None,
+    parameters: str,
+    algorithm: str,
     output: Path | None,
     picture: Path | None,
     force: bool,
@@ -60,6 +70,7 @@ def command(
     """Fit mounts to a PAINT directory or to poses, pictures and flights, and say how far to trust them.
 
     Several sources of a heliostat go into one fit; without --mount it begins with the mounts that PAINT describes.
+    A heliostat that cannot be read or fitted is left out, with the reason; the others go on.
     Errors are of the mirror normal; the beam's are twice that. Held-out: ten random splits, 60 % fitted, 40 % judged.
     Radio poses need motor positions, and a second source to tell the receivers' plane from the mirror.
     """
@@ -70,19 +81,33 @@ def command(
     if bool(radio) != (motors is not None):
         raise click.UsageError("--radio and --motors belong together: a pose alone does not say what the motors did")
 
+    from rfpose.feedback.mount import PARAMETERS
     from rfpose.pipeline.calibrate import draw_errors, write_models
+    from rfpose.pipeline.files import refuse_existing
 
-    words = parameters or ("edwards-4" if directory is None else "level-full")
-    free = tuple(words.split(",")) if "," in words or words.endswith(("_rad", "_m")) else words
-    reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free)
+    for path in (output, picture):
+        if path is not None:
+            refuse_existing(path, force=force or path == picture)
+    free = tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters
+    reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free, algorithm)
     if output is not None:
-        write_models(output, reports, settings={"parameters": words}, force=force)
+        write_models(output, reports, settings={"parameters": parameters}, force=force)
     if picture is not None:
         draw_errors(picture, reports)
     if wants_json():
-        emit_json({"heliostats": [report.as_dict() for report in reports], "parameters": words})
+        emit_json(
+            {
+                "heliostats": [report.as_dict() for report in reports],
+                "skipped": dict(reports.skipped),
+                "parameters": parameters,
+            }
+        )
+    else:
+        _show(reports)
+    for name, reason in reports.skipped.items():
+        click.echo(f"rfpose: heliostat {name} left out: {reason}", err=True)
+    if wants_json():
         return
-    _show(reports)
     for path in (output, picture):
         if path is not None:
             say(f"wrote {path}")
@@ -97,17 +122,18 @@ def _fit(
     drone: Path | None,
     heliostats: tuple[str, ...],
     free: str | tuple[str, ...],
-) -> tuple[HeliostatReport, ...]:
+    algorithm: str,
+) -> Calibrations:
     """Read what was named and fit it."""
     from rfpose.pipeline.calibrate import calibrate_mounts, calibrate_paint
     from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_paint, read_radio
     from rfpose.pipeline.mount_file import read_models
 
     if directory is not None and mounts is None and not (radio or camera or drone):
-        return calibrate_paint(directory, heliostats=heliostats, free=free)
+        return calibrate_paint(directory, heliostats=heliostats, free=free, algorithm=algorithm)
     gathered = []
     if directory is not None:
-        records, planned = read_paint(directory, heliostats)
+        records, planned = read_paint(directory, heliostats, algorithm=algorithm)
         gathered.append(records)
     if mounts is not None:
         planned = read_models(mounts)
@@ -121,7 +147,7 @@ def _fit(
     return calibrate_mounts(planned, gathered, heliostats=heliostats, free=free)
 
 
-def _show(reports: tuple[HeliostatReport, ...]) -> None:
+def _show(reports: Calibrations) -> None:
     """Print errors, parameters and alarms."""
     plain = [report.as_dict() for report in reports]
     rows = [
@@ -141,6 +167,11 @@ def _show(reports: tuple[HeliostatReport, ...]) -> None:
             [name, *_shown(name, entry["estimate"], entry["sigma"])] for name, entry in item["parameters"].items()
         ]
         table(f"{item['heliostat']}: parameters", ["", "estimate", "sigma", "unit"], values)
+        if item["choice"]:
+            say(f"  chosen: {item['choice']['chosen']}: {item['choice']['reason']}")
+        carried = f"{item['parameters_carried']:.1f} of {len(item['parameters'])} parameters"
+        assumed = ", assumed" if item["noise_assumed"] else ""
+        say(f"  carried by the records: {carried}; noise {item['noise_mrad']:.2f} mrad{assumed}")
         for group in item["undetermined"]:
             say(f"  undetermined, the data cannot tell apart: {', '.join(group)}")
         for note in item["notes"]:

@@ -2,7 +2,8 @@
 
 Each measurement's error is told as what the two axes would have to be wrong by. A shift (re-homed, hit, a belt that
 jumped) is a change of level from one measurement on; the cheapest partition into runs finds them all. Drift is a slope
-(Theil and Sen's) between shifts that adds up to more than the limit.
+(Theil and Sen's) between shifts that adds up to more than the limit of a shift, or goes on at a rate that a year's
+drift tells.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from rfpose.checks import FloatArray, as_positive
 from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
 
 __all__ = ["Alarm", "alarms", "axis_errors_rad"]
+
+_YEAR_S = 365.25 * 86400.0
+_LEAST_SPAN_S = 90.0 * 86400.0
+_LEAST_DRIFT_RAD = 0.4e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +64,12 @@ def axis_errors_rad(calibration: Calibration) -> FloatArray:
 
 
 def alarms(
-    calibration: Calibration, *, outlier_rad: float = 5e-3, shift_rad: float = 2e-3, least_run: int = 3
+    calibration: Calibration,
+    *,
+    outlier_rad: float = 5e-3,
+    shift_rad: float = 2e-3,
+    drift_rad_per_year: float = 0.45e-3,
+    least_run: int = 3,
 ) -> tuple[Alarm, ...]:
     """Return what happened to a heliostat in the course of its measurements.
 
@@ -71,13 +81,17 @@ def alarms(
         Error of the normal from which on a measurement is an outlier [rad].
     shift_rad
         Step or total drift of an axis that is worth an alarm [rad]; it must also stand out of the scatter.
+    drift_rad_per_year
+        Rate of drift that is worth an alarm even where it has not yet added up to ``shift_rad`` [rad/year]; it must
+        have gone on for three months, have added up to 0.4 mrad and be sure.
     least_run
         Fewest measurements on either side of a step.
     """
     as_positive("outlier_rad", outlier_rad)
     as_positive("shift_rad", shift_rad)
+    as_positive("drift_rad_per_year", drift_rad_per_year)
     order = np.argsort(calibration.measurements.unix_s, kind="stable")
-    error = axis_errors_rad(calibration)[order]
+    error, unix_s = axis_errors_rad(calibration)[order], calibration.measurements.unix_s[order]
     found = [
         Alarm(kind="outlier", first=i, last=i, axis=1 + int(np.argmax(np.abs(error[i]))), size_rad=float(size))
         for i, size in enumerate(calibration.error_rad[order])
@@ -93,7 +107,7 @@ def alarms(
             last = int(index[after - 1])
             found.append(Alarm(kind="shift", first=int(index[at]), last=last, axis=axis + 1, size_rad=step))
         for a, b in itertools.pairwise(edges):
-            drift = _drift(series[a:b], shift_rad)
+            drift = _drift(series[a:b], unix_s[index[a:b]], shift_rad, drift_rad_per_year)
             if drift is not None:
                 found.append(
                     Alarm(kind="drift", first=int(index[a]), last=int(index[b - 1]), axis=axis + 1, size_rad=drift)
@@ -150,10 +164,20 @@ def _steps(series: npt.NDArray[np.float64], cuts: list[int], limit: float) -> li
     return left
 
 
-def _drift(part: npt.NDArray[np.float64], limit: float) -> float | None:
-    """Total change along a run, if it is sure and beyond the limit."""
+def _drift(
+    part: npt.NDArray[np.float64], unix_s: npt.NDArray[np.float64], limit: float, limit_per_year: float
+) -> float | None:
+    """Total change along a run, if it is sure and beyond one of the limits."""
     if len(part) < 10:
         return None
     slope, _, low, high = theilslopes(part, alpha=0.997)
     total = float(slope) * (len(part) - 1)
-    return total if abs(total) > limit and low * high > 0.0 else None
+    if abs(total) > limit and low * high > 0.0:
+        return total
+    span_s = float(unix_s[-1] - unix_s[0])
+    if not span_s >= _LEAST_SPAN_S:
+        return None
+    slope, _, low, high = theilslopes(part, unix_s - unix_s[0], alpha=0.997)
+    total = float(slope) * span_s
+    fast = abs(float(slope)) * _YEAR_S > limit_per_year and abs(total) > _LEAST_DRIFT_RAD
+    return total if fast and low * high > 0.0 else None

@@ -16,8 +16,10 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, check_names
 
 __all__ = [
+    "LEAST_REDUNDANCY",
     "PARAMETER_SETS",
     "Calibration",
+    "Choice",
     "FieldCalibration",
     "FitSettings",
     "FitStatus",
@@ -49,12 +51,18 @@ PARAMETER_SETS: dict[str, tuple[str, ...]] = {
         "drone_camera_up_m",
     ),
     "level-4": (*_LEVEL, *_ZEROS),
+    # what real ones need first beyond the four: canting about the mirror's upright
+    "level-5": (*_LEVEL, *_ZEROS, "canting_right_rad"),
     "level-7": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES),
     "level-8": (*_PEDESTAL, "pedestal_twist_rad", *_ZEROS, "nonorthogonality_rad", *_STROKES),
+    "level-canting": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES, "canting_right_rad"),
     "level-location": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES, *_LOCATION, *_RADII),
     "level-full": (*_LEVEL, *_ZEROS, "nonorthogonality_rad", *_STROKES, "canting_right_rad", *_LOCATION),
 }  # fmt: skip
 """Usual sets of free parameters. ``level-…`` are for an axis 1 that lies east-west, as PAINT's."""
+
+LEAST_REDUNDANCY = 8.0
+"""Components beyond what the parameters take up, from which on residuals alone tell the noise."""
 
 
 class FitStatus(IntEnum):
@@ -83,7 +91,8 @@ class FitSettings:
     ----------
     sigma_known
         The measurements' sigmas are absolute. Otherwise they only weigh the measurements against each other and
-        the noise is estimated from the residuals.
+        the noise is estimated from the residuals. What these lack of `LEAST_REDUNDANCY` components is made up by
+        the stated sigma: a fit through every point says nothing of the noise.
     huber
         Residuals beyond this many sigma count linearly. One loses 11 % of the information if the noise is
         Gaussian, and is the better for it where the model's own errors dominate. Infinity: plain least squares.
@@ -91,6 +100,9 @@ class FitSettings:
         Lowest and highest value by parameter.
     priors
         Mean and standard deviation by parameter.
+    least_noise
+        The noise is no less than this, in units of the stated sigma; what held-out measurements tell, where the
+        residuals of the fit flatter it.
     rank_tolerance
         A singular value below this part of the largest is none; columns have length one.
     max_iteration
@@ -106,6 +118,7 @@ class FitSettings:
     huber: float = 1.0
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    least_noise: float = 0.0
     rank_tolerance: float = 1e-5
     max_iteration: int = 60
 
@@ -119,6 +132,8 @@ class FitSettings:
             as_positive(f"priors[{name}] sigma", sigma)
         if not self.huber > 0.0:
             raise InvalidInputError(f"`huber` must be greater than zero, got {self.huber}")
+        if not 0.0 <= self.least_noise < float("inf"):
+            raise InvalidInputError(f"`least_noise` must be zero or greater and finite, got {self.least_noise}")
         as_positive("rank_tolerance", self.rank_tolerance)
 
 
@@ -147,8 +162,13 @@ class FieldCalibration:
         determined.
     column_length : (heliostat, free)
         Lengths of the Jacobian's columns, in sigma by unit of the parameter.
+    carried : (heliostat,)
+        Parameters that the data carry: the rank, less what priors tell.
+    redundancy : (heliostat,)
+        Measured components, two a measurement, less `carried`.
     noise : (heliostat,)
-        Sigma of the residuals in units of the stated sigma: estimated, or one.
+        Sigma of the residuals in units of the stated sigma: estimated, or one. Below `LEAST_REDUNDANCY` what is
+        missing counts as one.
     iterations : (heliostat,)
         Steps taken.
     status : (heliostat,)
@@ -164,6 +184,8 @@ class FieldCalibration:
     condition: FloatArray
     ambiguity: FloatArray
     column_length: FloatArray
+    carried: FloatArray
+    redundancy: FloatArray
     noise: FloatArray
     iterations: npt.NDArray[np.int64]
     status: npt.NDArray[np.int8]
@@ -186,6 +208,33 @@ class FieldCalibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Which set of parameters was chosen for a heliostat, and why.
+
+    Attributes
+    ----------
+    chosen
+        Name of the set.
+    free
+        Its parameters.
+    held_out_rad
+        Mean error of the normal by set, each time-block predicted from the others, outliers capped [rad]; empty
+        where there were too few measurements to hold any out.
+    held_out_sigma
+        Scatter of those errors under the chosen set, one component, in units of the stated sigma; zero where none
+        were held out.
+    reason
+        The same in words.
+    """
+
+    chosen: str
+    free: tuple[str, ...]
+    held_out_rad: Mapping[str, float]
+    held_out_sigma: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
     """A calibrated heliostat.
 
@@ -203,6 +252,8 @@ class Calibration:
         Angle between modelled and measured normal [rad], also of rows that did not take part; NaN if unknown.
     settings
         How it was fitted.
+    choice
+        How its parameters were chosen; None where the caller named them.
     """
 
     mount: Mount
@@ -211,6 +262,7 @@ class Calibration:
     row_status: npt.NDArray[np.int8]
     error_rad: FloatArray
     settings: FitSettings
+    choice: Choice | None = None
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -253,6 +305,11 @@ class Calibration:
         return float(self.field.noise[0] * np.median(self.measurements.sigma_rad))
 
     @property
+    def noise_assumed(self) -> bool:
+        """Whether the noise rests on the stated sigma, for want of redundant measurements."""
+        return not self.settings.sigma_known and bool(self.field.redundancy[0] < LEAST_REDUNDANCY)
+
+    @property
     def used(self) -> npt.NDArray[np.bool_]:
         """Which measurements took part."""
         return np.asarray(self.row_status == RowStatus.USED)
@@ -273,6 +330,10 @@ class Known(Protocol):
     def column_length(self) -> FloatArray: ...  # noqa: D102
     @property
     def noise_rad(self) -> float: ...  # noqa: D102
+    @property
+    def noise_assumed(self) -> bool: ...  # noqa: D102
+    @property
+    def choice(self) -> Choice | None: ...  # noqa: D102
 
 
 def resolve_free(free: str | Sequence[str]) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ All milliradians here are of the mirror normal; the beam moves by twice as much.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +38,7 @@ from rfpose.feedback.prediction import (
     posture_jacobian,
     predict,
 )
-from rfpose.feedback.uncertainty import uncertainty
+from rfpose.feedback.uncertainty import Problem, noise_with_assumed, uncertainty
 
 __all__ = [
     "PARAMETER_SETS",
@@ -58,7 +59,17 @@ __all__ = [
     "resolve_free",
     "row_status",
     "solve",
+    "sun_convention",
 ]
+
+_TURNS = 4
+_FAR_RAD = 0.15
+_CONSISTENT_RAD = 0.02
+_COUNTED = {
+    (-1.0, -1.0): "is counted from south (add π)",
+    (-1.0, 1.0): "runs counter-clockwise (change its sign)",
+    (1.0, -1.0): "is counted from south and counter-clockwise (π minus it)",
+}
 
 
 def fit(
@@ -84,13 +95,16 @@ def fit(
     Raises
     ------
     InvalidInputError
-        Fewer usable measurements than the free parameters need; a sun azimuth of another convention.
+        Fewer usable measurements than the free parameters need; a sun azimuth of another convention; measurements
+        that are far from the mount and from each other.
     """
     chosen = settings or FitSettings()
     names = resolve_free(free)
     status = row_status(mount, measurements)
     used = status == RowStatus.USED
-    _check_convention(mount, measurements.take(used))
+    before, signs = sun_convention(mount, measurements)
+    if signs is not None:
+        raise InvalidInputError(f"the sun's azimuth evidently {_COUNTED[signs]}; rfpose counts from north, clockwise")
     field_fit = fit_many([mount], [measurements], free=names, settings=chosen)
     if field_fit.status[0] == FitStatus.TOO_FEW:
         raise InvalidInputError(
@@ -98,12 +112,20 @@ def fit(
             f"{int(used.sum())} usable of {len(measurements)}{_reasons(status)}; free fewer or give priors"
         )
     fitted = mount.replace(**dict(zip(names, field_fit.working[0].tolist(), strict=True)))
+    error_rad = normal_errors_rad(fitted, measurements)
+    after = float(np.nanmedian(error_rad[used]))
+    if before > _FAR_RAD and after > _CONSISTENT_RAD:
+        raise InvalidInputError(
+            f"measured and planned normals differ by {1e3 * before:.0f} mrad in the median, and fitted ones still by "
+            f"{1e3 * after:.0f}: check that motor positions are in the mount's counts, positions in the site frame, "
+            "and angles in the unit that is asked for"
+        )
     return Calibration(
         mount=fitted,
         measurements=measurements,
         field=field_fit,
         row_status=status,
-        error_rad=normal_errors_rad(fitted, measurements),
+        error_rad=error_rad,
         settings=chosen,
     )
 
@@ -192,20 +214,20 @@ def solve(
     masked = use & enough[:, None]
     start = p.copy()
     start[:, index] = np.clip(start[:, index], low, high)
-    fitted, iterations, noise = _kernels.fit_batch(
-        start, k, count, row, masked, index, scale, low, high, mean, weight,
-        settings.huber, settings.sigma_known, settings.max_iteration,
-    )  # fmt: skip
+    problem = Problem(k=k, count=count, row=row, use=masked, index=index, scale=scale, prior_weight=weight)
+    bounds = (low, high, mean)
+    fitted, iterations, noise = _minimise(start, problem, bounds, settings)
+    carried = problem.carried(fitted, noise)
+    redundancy = 2.0 * masked.sum(axis=1) - carried
+    if not settings.sigma_known and not settings.priors:
+        noise = noise_with_assumed(noise, masked, redundancy)
     status = np.where(iterations < 0, FitStatus.NOT_SETTLED, FitStatus.OK).astype(np.int8)
     status[~enough] = FitStatus.TOO_FEW
-    if not settings.sigma_known:
-        components = 2.0 * masked.sum(axis=1)
-        noise *= np.sqrt(components / np.maximum(components - len(free), 1.0))
     working = fitted[:, index]
     working[~enough] = np.nan
-    noise[~enough] = np.nan
-    spread = np.where(enough & (noise > 0.0), noise, 1.0)
-    known = uncertainty(fitted, k, count, row, masked, index, scale, spread, weight, settings)
+    residual_noise = np.where(enough & (noise > 0.0), noise, 1.0)
+    noise = np.where(enough, np.maximum(noise, settings.least_noise), np.nan)
+    known = uncertainty(problem, fitted, residual_noise, redundancy, settings)
     covariance, ambiguity, rank, condition, length = known
     blind = np.einsum("hff->hf", ambiguity) > 0.02
     sigma = np.sqrt(np.einsum("hff->hf", covariance))
@@ -222,10 +244,42 @@ def solve(
         condition=read_only(condition),
         ambiguity=read_only(ambiguity),
         column_length=read_only(length),
+        carried=read_only(carried),
+        redundancy=read_only(redundancy),
         noise=read_only(noise),
         iterations=read_only(np.abs(iterations)),
         status=read_only(status),
     )
+
+
+def _minimise(
+    start: FloatArray, problem: Problem, bounds: tuple[FloatArray, FloatArray, FloatArray], settings: FitSettings
+) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+    """Return fitted parameters, iterations and noise in units of the stated sigma.
+
+    Priors and residuals are weighed by the noise, and how much of the residuals the parameters took up depends on
+    the priors: the noise is found in turns with the fit, beginning with what is stated. Found inside the fit it
+    would go to zero, and the priors with it, as soon as the parameters reach every point.
+    """
+    low, high, mean = bounds
+
+    def kernel(p: FloatArray, row: FloatArray, known: bool) -> Any:
+        return _kernels.fit_batch(
+            p, problem.k, problem.count, row, problem.use, problem.index, problem.scale, low, high, mean,
+            problem.prior_weight, settings.huber, known, settings.max_iteration,
+        )  # fmt: skip
+
+    if settings.sigma_known or not settings.priors:
+        found: tuple[FloatArray, npt.NDArray[np.int64], FloatArray] = kernel(start, problem.row, settings.sigma_known)
+        return found
+    noise, fitted = np.ones(len(start)), start
+    for _ in range(_TURNS):
+        row = problem.row.copy()
+        row[..., 8] *= noise[:, None]
+        fitted, iterations, _ = kernel(fitted, row, True)
+        redundancy = 2.0 * problem.use.sum(axis=1) - problem.carried(fitted, noise)
+        noise = noise_with_assumed(problem.scatter(fitted), problem.use, redundancy)
+    return fitted, iterations, noise
 
 
 def _limits(
@@ -258,27 +312,31 @@ def _reasons(status: npt.NDArray[np.int8]) -> str:
     return f" ({', '.join(texts)})" if texts else ""
 
 
-def _check_convention(mount: Mount, measurements: Measurements) -> None:
-    """Refuse a sun whose azimuth is evidently counted otherwise, and say how."""
+def sun_convention(mount: Mount, measurements: Measurements) -> tuple[float, tuple[float, float] | None]:
+    """Say whether the sun's azimuth is evidently counted otherwise than from north, clockwise.
+
+    Parameters
+    ----------
+    mount, measurements
+        As for `fit`.
+
+    Returns
+    -------
+    median_rad
+        Median error of the nominal mount's normals [rad]; zero without measurements of the sun.
+    signs
+        By which east and north must be multiplied to mend it; None if that does not help or nothing is wrong.
+    """
     sunny = measurements.take((measurements.row[:, 3] == 0.0) & (measurements.row[:, 7] == 1.0))
+    sunny = sunny.take(row_status(mount, sunny) == RowStatus.USED)
     if not len(sunny):
-        return
+        return 0.0, None
     before = float(np.nanmedian(normal_errors_rad(mount, sunny)))
-    if not before > 0.15:
-        return
-    changes = {
-        "is counted from south (add π)": (-1.0, -1.0),
-        "runs counter-clockwise (change its sign)": (-1.0, 1.0),
-        "is counted from south and counter-clockwise (π minus it)": (1.0, -1.0),
-    }
-    for text, (east, north) in changes.items():
-        row = sunny.row.copy()
-        row[:, 0] *= east
-        row[:, 1] *= north
-        changed = Measurements(count=sunny.count, row=row, unix_s=sunny.unix_s)
-        if float(np.nanmedian(normal_errors_rad(mount, changed))) < 0.3 * before:
-            raise InvalidInputError(f"the sun's azimuth evidently {text}; rfpose counts from north, clockwise")
-    raise InvalidInputError(
-        f"measured and nominal normals differ by {1e3 * before:.0f} mrad in the median: check that angles are "
-        "radians, motor positions are in the mount's counts and positions are in the site frame"
-    )
+    if before > _FAR_RAD:
+        for signs in _COUNTED:
+            row = sunny.row.copy()
+            row[:, :2] *= signs
+            changed = Measurements(count=sunny.count, row=row, unix_s=sunny.unix_s)
+            if float(np.nanmedian(normal_errors_rad(mount, changed))) < 0.3 * before:
+                return before, signs
+    return before, None

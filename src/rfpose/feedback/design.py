@@ -112,7 +112,7 @@ def _scaled_ambiguity(calibration: Known, usual: FloatArray) -> FloatArray:
     if not null.shape[1]:
         return np.zeros((len(usual), len(usual)))
     # the projection is for columns of length one: go back to parameters, then to usual sizes
-    lengths = calibration.column_length
+    lengths = np.where(calibration.column_length > 0.0, calibration.column_length, 1.0)  # zero: not seen at all
     basis, _ = np.linalg.qr(null / (lengths * usual)[:, None])
     return np.asarray(basis @ basis.T)
 

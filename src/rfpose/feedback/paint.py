@@ -1,10 +1,11 @@
 """Calibration records in the layout of PAINT, the public database of the Jülich solar tower.
 
-A directory holds one folder a heliostat (``BF57/``) with its properties and a folder of calibration records, the
-tower's measurements, and, if known, UTC times of the records (``timestamps.json``). Names are matched loosely, so
-that both the database's own dashes and underscores do. A record holds the motor positions of both axes, the sun's
-angles as the plant logged them (azimuth from south, east positive, degrees) and the centre of the focal spot in
-WGS84 as found by two independent image algorithms, HeliOS and UTIS.
+A directory holds one folder a heliostat (``BF57/``) with its properties and its calibration records, and the tower's
+measurements. Names are matched loosely, so that both the database's own dashes and underscores do. UTC times come from
+``timestamps.json`` or from the STAC items that lie beside the records. A record holds the motor positions of both axes,
+the sun's angles as the plant logged them (azimuth from south, east positive, degrees) and the centre of the focal spot
+in WGS84 as found by two independent image algorithms, HeliOS and UTIS. The elevation is that of the refracted sun, as
+a mirror sees it: nothing is added to it.
 
 References
 ----------
@@ -13,9 +14,8 @@ PAINT, doi:10.1038/s41560-026-02070-1; https://paint-database.org.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,30 @@ import numpy.typing as npt
 
 from rfpose import geometry
 from rfpose.checks import FloatArray
-from rfpose.errors import RecordingError
+from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.feedback.sun import Site, unix_seconds
+from rfpose.foreign import load_json
 
-__all__ = ["ALGORITHMS", "PaintHeliostat", "Target", "enu_from_wgs84", "heliostat_ids", "read_heliostat"]
+__all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "enu_from_wgs84", "heliostat_ids", "read_heliostat"]
 
 ALGORITHMS = ("HeliOS", "UTIS")
+CHOICES = ("both", "any", *ALGORITHMS)
 _MOUNT_FRAME = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # columns north, up, east
+_FACING = [0.0, -1.0, 0.0]
+_RECORD = re.compile(r"(\d{1,15}).calibration.properties\.json")
+_STAC_ITEM = re.compile(r"(\d{1,15}).calibration.item(?:.stac)?\.json")
+_MOTORS = ("axis_1_motor_position", "axis_2_motor_position")
+# PAINT's n is along the mirror's normal
+_ARMS = {
+    "arm_right_m": "concentrator_translation_e",
+    "arm_normal_m": "concentrator_translation_n",
+    "arm_up_m": "concentrator_translation_u",
+}
+_NO_PLACE = tuple(f"joint_translation_{axis}_{joint}" for joint in (1, 2) for axis in "enu")
 _PLANE_M = 0.5
+_FARTHEST_M = 1e5
+_HIGHEST_M = 1e4
 _WGS84_A, _WGS84_E2 = 6378137.0, 6.69437999014e-3
 
 
@@ -46,7 +61,7 @@ class Target:
     centre_enu_m : (xyz)
         Its centre, site ENU [m].
     normal_enu : (xyz)
-        Unit vector out of its front.
+        Unit vector out of its front, square to the plane of its corners.
     reach_m
         From the centre to the farthest corner [m]; infinite if the corners are not told.
     """
@@ -95,11 +110,13 @@ class PaintHeliostat:
     spot_enu_m : (record, xyz)
         Centre of the focal spot, mean of the algorithms [m].
     disagreement_m : (record,)
-        Distance of the two algorithms' centres [m].
+        Distance of the two algorithms' centres [m]; NaN with one of them.
     target : (record,)
         Name of the target.
     skipped
         Why records were left out, by record number.
+    notes
+        Times that could not be read.
     """
 
     id: str
@@ -116,6 +133,19 @@ class PaintHeliostat:
     disagreement_m: FloatArray
     target: tuple[str, ...]
     skipped: Mapping[str, str]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def order_s(self) -> FloatArray:
+        """Times, unknown ones between their neighbours' by number; the numbers themselves if fewer than two are known.
+
+        (record,)
+        """
+        known = np.isfinite(self.unix_s)
+        number = self.record_ids.astype(np.float64)
+        if known.sum() < 2:
+            return number
+        return np.where(known, self.unix_s, np.interp(number, number[known], self.unix_s[known]))
 
 
 def enu_from_wgs84(latitude_longitude_height: npt.ArrayLike, origin: npt.ArrayLike) -> FloatArray:
@@ -164,9 +194,14 @@ def heliostat_ids(directory: Path) -> tuple[str, ...]:
         The directory does not exist or holds none.
     """
     directory = Path(directory)
-    if not directory.is_dir():
-        raise RecordingError(f"{directory}: no such directory; give the folder that holds the heliostats' folders")
-    found = tuple(sorted(item.name for item in directory.iterdir() if item.is_dir() and _record_files(item)))
+    try:
+        folders = [item for item in directory.iterdir() if item.is_dir()]
+    except OSError as error:
+        raise RecordingError(
+            f"{directory}: cannot be read as a directory ({error.strerror}); give the folder that holds the "
+            "heliostats' folders"
+        ) from error
+    found = tuple(sorted(item.name for item in folders if _numbered(item, _RECORD)))
     if not found:
         raise RecordingError(
             f"{directory}: no heliostat folder with calibration records (ID/calibration/*_calibration_properties.json)"
@@ -184,60 +219,50 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
     heliostat
         Name such as ``"BF57"``.
     algorithm
-        ``"both"``: mean of HeliOS and UTIS, records with one of them are left out; or one of the two by name.
+        ``"both"``: mean of HeliOS and UTIS, records with one of them are left out. ``"any"``: mean of those there
+        are. Or one of the two by name.
 
     Raises
     ------
     RecordingError
-        A file is missing, is no JSON, or lacks a key; the message names it.
+        The tower's or the heliostat's file is missing, is no JSON, or has a key that is missing or cannot be used;
+        or no record can be used. The message names file and key.
+
+    Notes
+    -----
+    A record that cannot be used is left out, with its reason in ``skipped``. A time that cannot be read is NaN.
     """
     directory = Path(directory)
-    if algorithm != "both" and algorithm not in ALGORITHMS:
-        raise RecordingError(f"{directory}: no algorithm {algorithm!r}; known are both, {', '.join(ALGORITHMS)}")
+    if algorithm not in CHOICES:
+        raise InvalidInputError(f"no algorithm is called {algorithm!r}; known are {', '.join(CHOICES)}")
     folder = directory / heliostat
-    files = _record_files(folder)
+    files = _numbered(folder, _RECORD)
     if not files:
         raise RecordingError(
             f"{folder}: no calibration records; known heliostats: {', '.join(heliostat_ids(directory))}"
         )
     tower_path = _one_file(directory, r"tower.measurements\.json$", "the tower's measurements")
     tower = _read_json(tower_path)
-    origin = _key(tower, tower_path, "power_plant_properties", "coordinates")
-    path = _one_file(folder, rf"{re.escape(heliostat)}.*properties\.json$", "the heliostat's properties")
+    plant = _key(tower, tower_path, "power_plant_properties")
+    origin = _place(_key(plant, tower_path, "coordinates"), f"{tower_path}: power_plant_properties.coordinates")
+    targets = _targets(tower, tower_path, origin)
+    path = _one_file(folder, rf"({re.escape(heliostat)}.*|heliostat.)properties\.json$", "the heliostat's properties")
     mount = _mount(_read_json(path), path, origin)
-    times, targets = _times(directory, heliostat), _targets(tower, origin)
-    wanted = ALGORITHMS if algorithm == "both" else (algorithm,)
-    rows: list[tuple[float, int, list[float], list[float], FloatArray, float, str]] = []
+    rows: list[_Record] = []
     skipped: dict[str, str] = {}
     for number, file in files.items():
-        record = _read_json(file)
-        reason = _unusable(record, wanted)
-        if reason is not None:
-            skipped[str(number)] = reason
-            continue
-        motors = _key(record, file, "motor_position")
-        spots = enu_from_wgs84([record["focal_spot"][name] for name in wanted], origin)
-        target = targets.get(str(record.get("target_name", "")))
-        reason = target.misses(spots.mean(axis=0)) if target else None
-        if reason is not None:
-            skipped[str(number)] = reason
-            continue
-        rows.append(
-            (
-                times.get(number, np.nan),
-                number,
-                [_number(_key(motors, file, f"axis_{a}_motor_position"), file) for a in (1, 2)],
-                [_number(_key(record, file, f"sun_{name}"), file) for name in ("azimuth", "elevation")],
-                spots.mean(axis=0),
-                float(np.linalg.norm(spots[0] - spots[-1])),
-                str(record.get("target_name", "")),
-            )
-        )
+        try:
+            rows.append(_record(number, file, targets, origin, algorithm))
+        except (RecordingError, InvalidInputError) as error:
+            skipped[str(number)] = str(error)
     if not rows:
-        raise RecordingError(f"{folder}: none of {len(files)} records can be used: {next(iter(skipped.values()))}")
-    rows.sort(key=lambda row: row[1])  # numbers are given in the order of time; not every record has one
-    degrees = np.array([row[3] for row in rows])
+        raise RecordingError(
+            f"{folder}: none of {len(files)} records can be used, the first since: {next(iter(skipped.values()))}"
+        )
+    rows.sort(key=lambda row: row.number)  # numbers are given in the order of time; not every record has one
+    degrees = np.array([row.sun_deg for row in rows])
     azimuth, elevation = np.mod(np.pi - np.radians(degrees[:, 0]), 2.0 * np.pi), np.radians(degrees[:, 1])
+    times, bad_times = _times(directory, heliostat, [row.number for row in rows])
     return PaintHeliostat(
         id=heliostat,
         mount=mount,
@@ -247,24 +272,75 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
             altitude_m=float(origin[2]),
         ),
         targets=targets,
-        record_ids=np.array([row[1] for row in rows], np.int64),
-        unix_s=np.array([row[0] for row in rows]),
-        count=np.array([row[2] for row in rows]),
+        record_ids=np.array([row.number for row in rows], np.int64),
+        unix_s=times,
+        count=np.array([row.count for row in rows]),
         sun_enu=geometry.enu_from_azimuth_elevation(azimuth, elevation),
         sun_azimuth_rad=azimuth,
         sun_elevation_rad=elevation,
-        spot_enu_m=np.array([row[4] for row in rows]),
-        disagreement_m=np.array([row[5] for row in rows]) if len(wanted) > 1 else np.full(len(rows), np.nan),
-        target=tuple(row[6] for row in rows),
+        spot_enu_m=np.array([row.spot_enu_m for row in rows]),
+        disagreement_m=np.array([row.disagreement_m for row in rows]),
+        target=tuple(row.target for row in rows),
         skipped=skipped,
+        notes=bad_times,
     )
 
 
-def _record_files(folder: Path) -> dict[int, Path]:
-    """Calibration records of a heliostat by number."""
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """What one record's file says."""
+
+    number: int
+    count: list[float]
+    sun_deg: list[float]
+    spot_enu_m: FloatArray
+    disagreement_m: float
+    target: str
+
+
+def _record(number: int, file: Path, targets: Mapping[str, Target], origin: FloatArray, algorithm: str) -> _Record:
+    """Read a record, or say why it cannot be used."""
+    record = _read_json(file)
+    spots = enu_from_wgs84([_place(*spot) for spot in _spots(record, file, algorithm)], origin)
+    motors = _key(record, file, "motor_position")
+    count = [_number(_key(motors, file, name), file, f"motor_position.{name}") for name in _MOTORS]
+    sun = [_number(_key(record, file, name), file, name) for name in ("sun_azimuth", "sun_elevation")]
+    if not 0.0 < sun[1] <= 90.0:
+        where = "below the horizon" if sun[1] <= 0.0 else "beyond the zenith"
+        raise RecordingError(f"{file}: sun {where} (sun_elevation {sun[1]:g} degrees); records need the sun in the sky")
+    if abs(sun[0]) > 360.0:
+        raise RecordingError(f"{file}: sun_azimuth must be degrees within ±360, got {sun[0]:g}")
+    name = str(record.get("target_name", ""))
+    middle = spots.mean(axis=0)
+    reason = targets[name].misses(middle) if name in targets else None
+    if reason is not None:
+        raise RecordingError(f"{file}: {reason}")
+    if not np.linalg.norm(middle) < _FARTHEST_M:
+        raise RecordingError(f"{file}: focal spot {np.linalg.norm(middle) / 1e3:.0f} km from the plant")
+    apart = float(np.linalg.norm(spots[0] - spots[-1])) if len(spots) > 1 else float("nan")
+    return _Record(number, count, sun, middle, apart, name)
+
+
+def _spots(record: Mapping[str, Any], file: Path, algorithm: str) -> list[tuple[Any, str]]:
+    """Focal spots of the wanted algorithms, each with the words that name its place."""
+    spots = record.get("focal_spot")
+    if not isinstance(spots, dict) or not any(spots.get(name) for name in ALGORITHMS):
+        raise RecordingError(f"{file}: no focal spot; measure again")
+    wanted: tuple[str, ...] = ALGORITHMS if algorithm == "both" else (algorithm,)
+    if algorithm == "any":
+        wanted = tuple(name for name in ALGORITHMS if spots.get(name))
+    for name in wanted:
+        if not spots.get(name):
+            has = ", ".join(found for found in ALGORITHMS if spots.get(found))
+            raise RecordingError(f"{file}: no focal spot from {name} (has {has}); algorithm any takes what there is")
+    return [(spots[name], f"{file}: focal_spot.{name}") for name in wanted]
+
+
+def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
+    """Files of a heliostat whose names begin with a record's number, by that number."""
     found = {}
-    for path in folder.glob("[Cc]alibration/*.json"):
-        match = re.fullmatch(r"(\d+).calibration.properties\.json", path.name)
+    for path in sorted([*folder.glob("*.json"), *folder.glob("[Cc]alibration/*.json")]):
+        match = pattern.fullmatch(path.name)
         if match:
             found[int(match[1])] = path
     return dict(sorted(found.items()))
@@ -274,119 +350,187 @@ def _one_file(folder: Path, pattern: str, what: str) -> Path:
     """Find the file below ``folder`` whose name ends as the pattern says."""
     paths = sorted(p for p in folder.rglob("*.json") if re.search(pattern, p.name) and "alibration" not in p.name)
     if not paths:
-        raise RecordingError(f"{folder}: no file for {what} (name like {pattern!r})")
+        raise RecordingError(f"{folder}: no file for {what} (name like {pattern!r}); fetch it from PAINT")
     return paths[0]
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: is not JSON: {error}; fetch it again") from error
+    content = load_json(path, remedy="fetch it again")
     if not isinstance(content, dict):
-        raise RecordingError(f"{path}: must hold one JSON object, got a {type(content).__name__}")
+        raise RecordingError(f"{path}: must hold one JSON object, got a {type(content).__name__}; fetch it again")
     return content
 
 
-def _key(content: Any, path: Path, *keys: str) -> Any:
-    """Follow keys into nested objects; a missing one is named."""
-    for key in keys:
-        if not isinstance(content, dict) or key not in content:
-            raise RecordingError(f"{path}: has no {'.'.join(keys)!r} (missing {key!r})")
-        content = content[key]
-    return content
+def _key(content: Any, path: Path, key: str) -> Any:
+    if not isinstance(content, dict) or key not in content:
+        raise RecordingError(f"{path}: has no {key!r}; fetch it again")
+    return content[key]
 
 
-def _number(value: Any, path: Path) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: a number was expected, got {value!r:.40}") from error
-    if not np.isfinite(number):
-        raise RecordingError(f"{path}: a finite number was expected, got {value!r:.40}")
-    return number
+def _number(value: Any, path: Path, key: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise RecordingError(f"{path}: {key}: a number was expected, got {value!r:.40}; correct it")
+    return float(value)
 
 
-def _unusable(record: Mapping[str, Any], wanted: tuple[str, ...]) -> str | None:
-    """Why a record cannot be used, or None."""
-    spots = record.get("focal_spot")
-    if not isinstance(spots, dict) or not spots:
-        return "no focal spot"
-    for name in wanted:
-        spot = spots.get(name)
-        if not (isinstance(spot, list) and len(spot) == 3 and all(isinstance(x, int | float) for x in spot)):
-            return f"no focal spot from {name} (has {', '.join(spots)})"
-    if float(record.get("sun_elevation", 90.0)) <= 0.0:
-        return "sun below the horizon"
-    return None
+def _place(value: Any, where: str) -> FloatArray:
+    """Latitude, longitude and height out of a file."""
+    if (
+        not isinstance(value, list)
+        or len(value) != 3
+        or any(isinstance(x, bool) or not isinstance(x, int | float) for x in value)
+    ):
+        raise RecordingError(f"{where}: [latitude, longitude, height] was expected, got {value!r:.60}; correct it")
+    place = np.array(value, np.float64)
+    if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 360.0 and abs(place[2]) <= _HIGHEST_M):
+        raise RecordingError(f"{where}: must be degrees and metres on Earth, got {value!r:.60}; correct it")
+    return place
 
 
-def _times(directory: Path, heliostat: str) -> dict[int, float]:
-    """UTC times by record number; empty where there is no file."""
+def _times(directory: Path, heliostat: str, numbers: Sequence[int]) -> tuple[FloatArray, tuple[str, ...]]:
+    """UTC times of records, NaN where unknown, and what could not be read of them."""
     path = directory / "timestamps.json"
-    if not path.is_file():
-        return {}
-    table = _read_json(path)
-    keys = [key for key in table if key.startswith(f"{heliostat}_")]
-    return {
-        int(key.rsplit("_", 1)[1]): float(t)
-        for key, t in zip(keys, unix_seconds([table[k] for k in keys]), strict=True)
-    }
+    stated: dict[int, tuple[Any, str]] = {}
+    if path.exists():
+        table = _read_json(path)
+        stated = {
+            n: (table[f"{heliostat}_{n}"], f"{path}: {heliostat}_{n}") for n in numbers if f"{heliostat}_{n}" in table
+        }
+    items = _numbered(directory / heliostat, _STAC_ITEM)
+    notes, seconds = [], np.full(len(numbers), np.nan)
+    for i, number in enumerate(numbers):
+        try:
+            if number in stated:
+                text, where = stated[number]
+            elif number in items:
+                where = f"{items[number]}: properties.datetime"
+                text = _key(_key(_read_json(items[number]), items[number], "properties"), items[number], "datetime")
+            else:
+                continue
+            seconds[i] = _moment(text, where)
+        except RecordingError as error:
+            notes.append(f"{error}; record {number} goes by its number alone")
+    return seconds, tuple(notes)
 
 
-def _targets(tower: Mapping[str, Any], origin: Any) -> dict[str, Target]:
+def _moment(text: Any, where: str) -> float:
+    if not isinstance(text, str):
+        raise RecordingError(f"{where}: a time such as 2024-02-01T10:09:37Z was expected, got {text!r:.40}")
+    try:
+        return float(unix_seconds([text])[0])
+    except InvalidInputError as error:
+        raise RecordingError(f"{where}: {error}") from error
+
+
+def _targets(tower: Mapping[str, Any], path: Path, origin: FloatArray) -> dict[str, Target]:
     """Plane targets of the tower."""
     return {
-        name: Target(
-            centre_enu_m=enu_from_wgs84(entry["coordinates"]["center"], origin),
-            normal_enu=geometry.unit(entry["normal_vector"]),
-            reach_m=_reach_m(entry["coordinates"], origin),
-        )
+        name: _target(entry, path, name, origin)
         for name, entry in tower.items()
         if isinstance(entry, dict) and entry.get("type") == "planar"
     }
 
 
-def _reach_m(coordinates: Mapping[str, Any], origin: Any) -> float:
-    """Distance from a target's centre to its farthest corner."""
-    corners = [place for name, place in coordinates.items() if name != "center"]
-    if not corners:
-        return float("inf")
-    off = enu_from_wgs84(corners, origin) - enu_from_wgs84(coordinates["center"], origin)
-    return float(np.linalg.norm(off, axis=-1).max())
+def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray) -> Target:
+    """Plane through a target's corners; ``normal_vector`` only says which side is its front.
 
-
-def _mount(properties: Mapping[str, Any], path: Path, origin: Any) -> Mount:
-    """Mount of a heliostat whose axis 1 lies east-west and whose axis 2 lies in the mirror's plane."""
-    content = dict(properties)
-    kinematics = _key(content, path, "kinematics_properties")
-    entries = _key(kinematics, path, "actuators")
-    if len(entries) != 2:
-        raise RecordingError(f"{path}: two actuators were expected, got {len(entries)}")
-    return Mount(
-        pivot_enu_m=enu_from_wgs84(_key(content, path, "heliostat_position"), origin),
-        rot_enu_from_mount=_MOUNT_FRAME,
-        # axis 1 lowers the normal towards south as it opens; axis 2 turns it about the mirror's own upright
-        actuators=(_actuator(entries[0], path, -1), _actuator(entries[1], path, 1)),
-        parameters={"arm_normal_m": _number(_key(kinematics, path, "concentrator_translation_n"), path)},
+    PAINT's is grid north for every target, 2.8 to 5.5 mrad off the plane of the corners.
+    """
+    coordinates = _key(entry, path, "coordinates")
+    if not isinstance(coordinates, dict) or "center" not in coordinates:
+        raise RecordingError(f"{path}: {name}.coordinates has no 'center'; fetch it again")
+    places = {key: _place(value, f"{path}: {name}.coordinates.{key}") for key, value in coordinates.items()}
+    centre = enu_from_wgs84(places.pop("center"), origin)
+    front = _key(entry, path, "normal_vector")
+    if not isinstance(front, list) or len(front) != 3 or not all(isinstance(x, int | float) for x in front):
+        raise RecordingError(f"{path}: {name}.normal_vector: [east, north, up] was expected, got {front!r:.40}")
+    normal = geometry.unit(front)
+    if not np.isfinite(normal).all():
+        raise RecordingError(f"{path}: {name}.normal_vector: must have a direction, got {front!r:.40}")
+    if not places:
+        return Target(centre_enu_m=centre, normal_enu=normal)
+    corners = enu_from_wgs84(list(places.values()), origin)
+    _, size, axes = np.linalg.svd(corners - corners.mean(axis=0))
+    if len(corners) > 2 and size[1] > 0.1:  # metres: corners in a line span no plane
+        normal = axes[2] * (1.0 if axes[2] @ normal > 0.0 else -1.0)
+    return Target(
+        centre_enu_m=centre, normal_enu=normal, reach_m=float(np.linalg.norm(corners - centre, axis=-1).max())
     )
 
 
-def _actuator(entry: Any, path: Path, direction: int) -> Actuator:
+def _mount(properties: Mapping[str, Any], path: Path, origin: FloatArray) -> Mount:
+    """Mount of a heliostat whose axis 1 lies east-west and whose axis 2 lies in the mirror's plane."""
+    kinematics = _key(properties, path, "kinematics_properties")
+    entries = _key(kinematics, path, "actuators")
+    if not isinstance(entries, list) or len(entries) != 2:
+        raise RecordingError(f"{path}: kinematics_properties.actuators: two were expected, got {entries!r:.40}")
+    _refuse_other_geometry(properties, kinematics, path)
+    arms = {
+        parameter: _number(kinematics.get(key, 0.0), path, f"kinematics_properties.{key}")
+        for parameter, key in _ARMS.items()
+    }
+    return Mount(
+        pivot_enu_m=enu_from_wgs84(
+            _place(_key(properties, path, "heliostat_position"), f"{path}: heliostat_position"), origin
+        ),
+        rot_enu_from_mount=_MOUNT_FRAME,
+        # axis 1 lowers the normal towards south as it opens; axis 2 turns it about the mirror's own upright
+        actuators=(_actuator(entries[0], path, 1), _actuator(entries[1], path, 2)),
+        parameters=arms,
+    )
+
+
+def _refuse_other_geometry(properties: Mapping[str, Any], kinematics: Mapping[str, Any], path: Path) -> None:
+    """Refuse what the model has no place for: it would be off by as much, without a word."""
+    facing = properties.get("initial_orientation", _FACING)
+    if facing != _FACING:
+        raise RecordingError(
+            f"{path}: initial_orientation: only {_FACING} (south, as in Jülich) is known, got {facing!r:.40}; "
+            "describe the mount in a file for --mount"
+        )
+    for key in _NO_PLACE:
+        value = _number(kinematics.get(key, 0.0), path, f"kinematics_properties.{key}")
+        if value != 0.0:
+            raise RecordingError(
+                f"{path}: kinematics_properties.{key}: the model has axes that cross and no place for {value:g} m; "
+                "describe the mount in a file for --mount"
+            )
+
+
+def _actuator(entry: Any, path: Path, axis: int) -> Actuator:
+    place = f"kinematics_properties.actuators[{axis - 1}]"
+
     def value(name: str) -> float:
-        return _number(_key(entry, path, name), path)
+        return _number(_key(entry, path, name), path, f"{place}.{name}")
 
     kind = _key(entry, path, "type_axis")
     if kind != "linear":
-        raise RecordingError(f"{path}: only linear actuators are known in this layout, got {kind!r}")
+        raise RecordingError(
+            f"{path}: {place}.type_axis: only linear actuators are known in this layout, got {kind!r:.40}; "
+            "describe the mount in a file for --mount"
+        )
+    for name in ("offset_shift", "radius_shift"):
+        shift = _number(entry.get(name, 0.0), path, f"{place}.{name}")
+        if shift != 0.0:
+            raise RecordingError(
+                f"{path}: {place}.{name}: how a shift enters is not known here, got {shift:g}; add it to "
+                f"{'offset' if name == 'offset_shift' else 'pivot_radius'} and set it to zero"
+            )
+    for name in ("increment", "initial_stroke_length", "pivot_radius", "offset"):
+        if not value(name) > 0.0:
+            raise RecordingError(f"{path}: {place}.{name}: must be greater than zero, got {value(name):g}; correct it")
+    direction = -1 if axis == 1 else 1
     turning = -1 if value("clockwise_axis_movement") else 1
-    return Actuator(
-        kind="linear",
-        counts_per_unit=value("increment"),
-        sign=direction * turning,
-        angle_at_zero_rad=direction * value("initial_angle"),
-        stroke_m=value("initial_stroke_length"),
-        radius_m=value("pivot_radius"),
-        offset_m=value("offset"),
-        limits_count=(value("min_increment"), value("max_increment")),
-    )
+    try:
+        return Actuator(
+            kind="linear",
+            counts_per_unit=value("increment"),
+            sign=direction * turning,
+            angle_at_zero_rad=direction * value("initial_angle"),
+            stroke_m=value("initial_stroke_length"),
+            radius_m=value("pivot_radius"),
+            offset_m=value("offset"),
+            limits_count=(value("min_increment"), value("max_increment")),
+        )
+    except InvalidInputError as error:
+        raise RecordingError(f"{path}: {place}: {error}; correct it") from error

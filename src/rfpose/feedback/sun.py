@@ -10,13 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose import geometry
-from rfpose.checks import FloatArray, as_float_array, as_positive
+from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Site", "Sun", "sun_position", "unix_seconds"]
+__all__ = ["Site", "Sun", "site_from_degrees", "sun_position", "unix_seconds"]
 
 # ΔT = TT − UT1 has been 69 s to within 0.4 s since 2017; a second is 0.2 µrad of the sun's own motion.
 _DELTA_T_S = 69.2
+_ALTITUDES_M = (-500.0, 9000.0)
+_YEARS = (1900, 2200)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +39,8 @@ class Site:
     Raises
     ------
     InvalidInputError
-        A latitude or longitude that is not an angle in radians.
+        A latitude or longitude that is not an angle in radians; an altitude, pressure or temperature that no place on
+        Earth has.
     """
 
     latitude_rad: float
@@ -56,10 +59,19 @@ class Site:
                 f"`longitude_rad` must be within ±2π, got {self.longitude_rad}; degrees go through numpy.deg2rad"
             )
 
+        if not _ALTITUDES_M[0] <= self.altitude_m <= _ALTITUDES_M[1]:
+            raise InvalidInputError(
+                f"`altitude_m` must lie between {_ALTITUDES_M[0]:g} and {_ALTITUDES_M[1]:g} m, got {self.altitude_m}"
+            )
+        if self.pressure_pa is not None and not 0.0 <= self.pressure_pa <= 2e5:
+            raise InvalidInputError(f"`pressure_pa` must lie between 0 and 2e5 Pa, got {self.pressure_pa}")
+        if not -100.0 <= self.temperature_degc <= 100.0:
+            raise InvalidInputError(f"`temperature_degc` must lie within ±100 °C, got {self.temperature_degc}")
+
     def air_pressure_pa(self) -> float:
         """Stated pressure, or that of the standard atmosphere [Pa]."""
         if self.pressure_pa is not None:
-            return self.pressure_pa if self.pressure_pa == 0.0 else as_positive("pressure_pa", self.pressure_pa)
+            return self.pressure_pa
         return float(101325.0 * (1.0 - 2.25577e-5 * self.altitude_m) ** 5.25588)
 
 
@@ -82,13 +94,42 @@ class Sun:
     direction_enu: FloatArray
 
 
+def site_from_degrees(latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> Site:
+    """Return the site at a latitude and longitude in degrees, as files and commands give them.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg
+        WGS84, north and east positive [deg].
+    altitude_m
+        Above the ellipsoid [m].
+
+    Raises
+    ------
+    InvalidInputError
+        No number, or no place on Earth.
+    """
+    values = []
+    for name, value, low, high in (
+        ("latitude", latitude_deg, -90.0, 90.0),
+        ("longitude", longitude_deg, -360.0, 360.0),
+        ("altitude", altitude_m, *_ALTITUDES_M),
+    ):
+        unit = "m" if name == "altitude" else "degrees"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise InvalidInputError(f"the {name} must lie between {low:g} and {high:g} {unit}, got {value!r:.40}")
+        values.append(float(value))
+    latitude, longitude = np.radians(values[:2])
+    return Site(latitude_rad=float(latitude), longitude_rad=float(longitude), altitude_m=values[2])
+
+
 def unix_seconds(times: Sequence[datetime | str] | npt.NDArray[np.datetime64]) -> FloatArray:
     """Return seconds since 1970 UTC of datetimes, ISO 8601 texts or numpy datetimes.
 
     Raises
     ------
     InvalidInputError
-        A text that is no time, or a datetime without a time zone.
+        A text that is no time, a datetime without a time zone, a year before 1900 or after 2200.
     """
     if isinstance(times, np.ndarray) and times.dtype.kind == "M":
         return np.asarray(times.astype("datetime64[us]").astype(np.int64) * 1e-6)
@@ -97,9 +138,15 @@ def unix_seconds(times: Sequence[datetime | str] | npt.NDArray[np.datetime64]) -
         try:
             moment = datetime.fromisoformat(item) if isinstance(item, str) else item
         except ValueError as error:
-            raise InvalidInputError(f"`times` must be ISO 8601 such as 2024-02-01T10:09:37Z, got {item!r}") from error
+            raise InvalidInputError(
+                f"a time must be ISO 8601 such as 2024-02-01T10:09:37Z, got {item!r:.40}"
+            ) from error
+        if not isinstance(moment, datetime):
+            raise InvalidInputError(f"a time must be ISO 8601 such as 2024-02-01T10:09:37Z, got {item!r:.40}")
         if moment.tzinfo is None:
-            raise InvalidInputError(f"`times` must say their time zone (a trailing Z for UTC), got {item!r}")
+            raise InvalidInputError(f"a time must say its time zone (a trailing Z for UTC), got {item!r:.40}")
+        if not _YEARS[0] <= moment.year <= _YEARS[1]:
+            raise InvalidInputError(f"a time must lie in the years {_YEARS[0]} to {_YEARS[1]}, got {item!r:.40}")
         seconds.append(moment.astimezone(UTC).timestamp())
     return np.array(seconds, np.float64)
 

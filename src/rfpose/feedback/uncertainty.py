@@ -2,63 +2,143 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from scipy.special import erfc
 
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
-from rfpose.feedback.calibrated import FitSettings
+from rfpose.feedback.calibrated import LEAST_REDUNDANCY, FitSettings
 
-__all__ = ["uncertainty"]
+__all__ = ["RAYLEIGH_MEDIAN", "Problem", "noise_with_assumed", "uncertainty"]
+
+RAYLEIGH_MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """What a batch of fits is about, as the kernels read it.
+
+    Attributes
+    ----------
+    k : (heliostat, constant)
+        Constants of the mounts.
+    count : (heliostat, measurement, axis)
+        Motor positions.
+    row : (heliostat, measurement, 10)
+        Sources, targets and sigmas.
+    use : (heliostat, measurement)
+        What takes part.
+    index, scale : (free,)
+        Free parameters and their usual size.
+    prior_weight : (free,)
+        One over the priors' variances; zero without.
+    """
+
+    k: FloatArray
+    count: FloatArray
+    row: FloatArray
+    use: npt.NDArray[np.bool_]
+    index: npt.NDArray[np.int64]
+    scale: FloatArray
+    prior_weight: FloatArray
+
+    def blocks(self) -> Iterator[slice]:
+        """Heliostats in blocks, to bound the memory of their Jacobians."""
+        size = max(1, 4_000_000 // (self.row.shape[1] * 3 * len(self.index)))
+        return (slice(i, i + size) for i in range(0, len(self.k), size))
+
+    def residual(self, p: FloatArray, s: slice) -> FloatArray:
+        """Residuals of a block in stated sigmas (heliostat, measurement, xyz)."""
+        out: FloatArray = _kernels.residuals_batch(p[s], self.k[s], self.count[s], self.row[s], self.use[s])
+        return out
+
+    def jacobian(self, p: FloatArray, s: slice) -> FloatArray:
+        """Their derivatives by the free parameters (heliostat, measurement, xyz, free)."""
+        out: FloatArray = _kernels.jacobian_batch(
+            p[s], self.k[s], self.count[s], self.row[s], self.use[s], self.index, self.scale
+        )
+        return np.nan_to_num(np.where(self.use[s][..., None, None], out, 0.0), posinf=0.0, neginf=0.0)
+
+    def scatter(self, p: FloatArray) -> FloatArray:
+        """Sigma of the residuals by their median, in stated sigmas (heliostat,); zero without measurements."""
+        norm = np.linalg.norm(self.residual(p, slice(None)), axis=-1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a heliostat without measurements
+            median = np.nanmedian(np.where(self.use, norm, np.nan), axis=1)
+        return np.asarray(np.nan_to_num(median) / RAYLEIGH_MEDIAN)
+
+    def carried(self, p: FloatArray, noise: FloatArray) -> FloatArray:
+        """Parameters that the data carry, priors left out (heliostat,): the trace of their share of the information."""
+        parts = []
+        for s in self.blocks():
+            jacobian = self.jacobian(p, s).reshape(-1, self.row.shape[1] * 3, len(self.index))
+            data = np.swapaxes(jacobian, 1, 2) @ jacobian
+            # in units of the noise; without priors it does not matter
+            prior = self.prior_weight * np.maximum(np.nan_to_num(noise[s, None]), 1e-9) ** 2
+            length = np.sqrt(np.einsum("hff->hf", data) + prior)
+            safe = np.where(length > 0.0, length, 1.0)
+            data /= safe[:, :, None] * safe[:, None, :]
+            both = data + np.einsum("hf,fg->hfg", prior / safe**2, np.eye(len(self.index)))
+            parts.append(np.einsum("hfg,hgf->h", data, np.linalg.pinv(both, rcond=1e-10, hermitian=True)))
+        return np.concatenate(parts)
+
+
+def noise_with_assumed(scatter: FloatArray, use: npt.NDArray[np.bool_], redundancy: FloatArray) -> FloatArray:
+    """Return the noise in stated sigmas: the residuals', freed of what the parameters took up.
+
+    What the redundancy lacks of `LEAST_REDUNDANCY` components is made up by the stated sigma itself.
+    """
+    components = 2.0 * use.sum(axis=1)
+    missing = np.clip(LEAST_REDUNDANCY - redundancy, 0.0, LEAST_REDUNDANCY)
+    return np.asarray(np.sqrt((missing + components * scatter**2) / np.maximum(redundancy, LEAST_REDUNDANCY)))
 
 
 def uncertainty(
-    p: FloatArray,
-    k: FloatArray,
-    count: FloatArray,
-    row: FloatArray,
-    use: npt.NDArray[np.bool_],
-    index: npt.NDArray[np.int64],
-    scale: FloatArray,
-    noise: FloatArray,
-    prior_weight: FloatArray,
-    settings: FitSettings,
+    problem: Problem, p: FloatArray, noise: FloatArray, redundancy: FloatArray, settings: FitSettings
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Covariance, projection onto what is undetermined, rank, condition, lengths; in blocks, to bound the memory."""
+    """Covariance, projection onto what is undetermined, rank, condition, lengths."""
     parts = []
-    block = max(1, 4_000_000 // (row.shape[1] * 3 * len(index)))
-    for i in range(0, len(p), block):
-        s = slice(i, i + block)
-        residual = _kernels.residuals_batch(p[s], k[s], count[s], row[s], use[s])
-        jacobian = _kernels.jacobian_batch(p[s], k[s], count[s], row[s], use[s], index, scale)
-        norm = np.linalg.norm(residual, axis=-1)
-        spread = _efficiency(norm / noise[s, None], use[s], settings) * noise[s] ** 2
+    for s in problem.blocks():
+        norm = np.linalg.norm(problem.residual(p, s), axis=-1)
+        efficiency = _efficiency(norm / noise[s, None], problem.use[s], redundancy[s], settings)
+        spread = efficiency * np.maximum(noise[s], settings.least_noise) ** 2
         # an exact fit has no scatter of its own; keep clear of zero
-        jacobian *= (use[s] / np.sqrt(np.maximum(spread, 1e-18))[:, None])[..., None, None]
-        prior = np.broadcast_to(np.diag(np.sqrt(prior_weight)), (len(jacobian), len(index), len(index)))
-        rows = np.concatenate([jacobian.reshape(len(jacobian), -1, len(index)), prior], axis=1)
-        parts.append(_subspaces(np.nan_to_num(rows), settings.rank_tolerance))
+        jacobian = problem.jacobian(p, s) / np.sqrt(np.maximum(spread, 1e-18))[:, None, None, None]
+        n_free = len(problem.index)
+        prior = np.broadcast_to(np.diag(np.sqrt(problem.prior_weight)), (len(jacobian), n_free, n_free))
+        rows = np.concatenate([jacobian.reshape(len(jacobian), -1, n_free), prior], axis=1)
+        parts.append(_subspaces(rows, settings.rank_tolerance))
     covariance, ambiguity, rank, condition, length = (np.concatenate(items) for items in zip(*parts, strict=True))
     return covariance, ambiguity, rank, condition, length
 
 
-def _efficiency(norm: FloatArray, use: npt.NDArray[np.bool_], settings: FitSettings) -> FloatArray:
+def _efficiency(
+    norm: FloatArray, use: npt.NDArray[np.bool_], redundancy: FloatArray, settings: FitSettings
+) -> FloatArray:
     """Variance of Huber's estimate over that of least squares on the same Jacobian, both for sigma one.
 
     Mean square of the loss's slope over the squared mean of its curvature, in two dimensions: expected for Gaussian
-    noise where sigma is known, else of the residuals themselves.
+    noise where sigma is known or assumed, else of the residuals themselves, freed of what the parameters took up.
     """
     cut = settings.huber
+    tail = float(np.exp(-0.5 * cut**2))
+    linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0
+    expected = np.full(len(norm), (1.0 - tail) / (1.0 - tail + linear) ** 2)
     if settings.sigma_known:
-        tail = float(np.exp(-0.5 * cut**2))
-        linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0
-        return np.full(len(norm), (1.0 - tail) / (1.0 - tail + linear) ** 2)
+        return expected
     n = np.maximum(use.sum(axis=1), 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # a heliostat with too few measurements
         curvature = np.where(norm <= cut, 1.0, 0.5 * cut / norm)
         slope = 0.5 * np.sum(np.where(use, np.minimum(norm, cut) ** 2, 0.0), axis=1) / n
-        return np.asarray(slope / (np.sum(np.where(use, curvature, 0.0), axis=1) / n) ** 2)
+        own = slope / (np.sum(np.where(use, curvature, 0.0), axis=1) / n) ** 2
+    own = np.nan_to_num(own) * 2.0 * n / np.maximum(redundancy, LEAST_REDUNDANCY)
+    missing = np.clip(1.0 - redundancy / LEAST_REDUNDANCY, 0.0, 1.0)
+    return np.asarray(missing * expected + own)
 
 
 def _subspaces(

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.feedback import _kernels
-from rfpose.feedback.calibration import FieldCalibration, FitSettings, resolve_free, row_status, solve
+from rfpose.feedback.calibration import FieldCalibration, FitSettings, FitStatus, resolve_free, row_status
 from rfpose.feedback.measurements import Measurements
-from rfpose.feedback.mount import PARAMETERS, Mount, stack_mounts
+from rfpose.feedback.mount import Mount
+from rfpose.feedback.selection import AUTO, chosen_errors_rad, refit
 
 __all__ = ["HeldOut", "Rolling", "chronological_split", "leave_one_out_rad", "random_splits", "rolling_refit"]
 
@@ -72,13 +72,17 @@ def random_splits(
     train_part: float = 0.6,
     n_split: int = 10,
     settings: FitSettings | None = None,
+    also: Sequence[str] = (),
 ) -> HeldOut:
     """Fit a random part and test on the rest, several times.
 
     Parameters
     ----------
-    mount, measurements, free, settings
+    mount, measurements, settings
         As for `calibration.fit`.
+    free, also
+        Likewise; or ``"auto"``: each part that is fitted chooses for itself, as `selection.fit_chosen` does, with
+        ``also`` free besides.
     rng
         Draws the parts.
     train_part
@@ -90,7 +94,7 @@ def random_splits(
     masks = np.zeros((n_split, len(measurements)), np.bool_)
     for mask in masks:
         mask[rng.permutation(usable)[: int(train_part * len(usable))]] = True
-    return _held_out(mount, measurements, masks, free, settings)
+    return _held_out(mount, measurements, masks, free, settings, also)
 
 
 def chronological_split(
@@ -100,13 +104,14 @@ def chronological_split(
     free: str | Sequence[str],
     train_part: float = 0.6,
     settings: FitSettings | None = None,
+    also: Sequence[str] = (),
 ) -> HeldOut:
     """Fit the earlier part and test on the later one: what a plant would have seen."""
     usable = _usable(mount, measurements, train_part)
     order = usable[np.argsort(measurements.unix_s[usable], kind="stable")]
     masks = np.zeros((1, len(measurements)), np.bool_)
     masks[0, order[: int(train_part * len(usable))]] = True
-    return _held_out(mount, measurements, masks, free, settings)
+    return _held_out(mount, measurements, masks, free, settings, also)
 
 
 def leave_one_out_rad(
@@ -119,7 +124,7 @@ def leave_one_out_rad(
     """Return the error of each measurement under the fit to all others (measurement,) [rad]; NaN where unusable."""
     usable = row_status(mount, measurements) == 0
     masks = usable & ~np.eye(len(measurements), dtype=np.bool_)
-    error, _ = _refit(mount, measurements, masks, free, settings)
+    error, _ = refit(mount, measurements, masks, resolve_free(free), settings or FitSettings())
     return np.where(usable, np.diagonal(error), np.nan)
 
 
@@ -146,7 +151,7 @@ def rolling_refit(
     masks = np.zeros((steps, len(measurements)), np.bool_)
     for i, mask in enumerate(masks):
         mask[usable[i : i + window]] = True
-    error, found = _refit(mount, measurements, masks, free, settings)
+    error, found = refit(mount, measurements, masks, resolve_free(free), settings or FitSettings())
     judged = usable[window:]
     return Rolling(
         unix_s=read_only(measurements.unix_s[judged]),
@@ -158,7 +163,10 @@ def rolling_refit(
 def _usable(mount: Mount, measurements: Measurements, train_part: float) -> npt.NDArray[np.int64]:
     if not 0.0 < train_part < 1.0:
         raise InvalidInputError(f"`train_part` must lie between 0 and 1, got {train_part}")
-    return np.flatnonzero(row_status(mount, measurements) == 0)
+    usable = np.flatnonzero(row_status(mount, measurements) == 0)
+    if not 0 < int(train_part * len(usable)) < len(usable):
+        raise InvalidInputError(f"{len(usable)} usable measurements cannot be split; measure more")
+    return usable
 
 
 def _held_out(
@@ -167,13 +175,18 @@ def _held_out(
     masks: npt.NDArray[np.bool_],
     free: str | Sequence[str],
     settings: FitSettings | None,
+    also: Sequence[str],
 ) -> HeldOut:
-    error, found = _refit(mount, measurements, masks, free, settings)
-    if np.any(found.status == 1):
-        raise InvalidInputError(
-            f"{len(found.free)} free parameters need more than the {int(masks[0].sum())} measurements of the part "
-            "to be fitted; free fewer"
-        )
+    if free == AUTO:
+        error = chosen_errors_rad(mount, measurements, masks, also=also, settings=settings)
+    else:
+        names = resolve_free(free)
+        error, found = refit(mount, measurements, masks, names, settings or FitSettings())
+        if np.any(found.status == FitStatus.TOO_FEW):
+            raise InvalidInputError(
+                f"{len(names)} free parameters need more than the {int(masks[0].sum())} measurements of the part "
+                "to be fitted; free fewer"
+            )
     test = np.where(~masks & (row_status(mount, measurements) == 0), error, np.nan)
     return HeldOut(
         train_median_rad=read_only(np.nanmedian(np.where(masks, error, np.nan), axis=1)),
@@ -182,24 +195,3 @@ def _held_out(
         error_rad=read_only(error),
         is_train=read_only(masks),
     )
-
-
-def _refit(
-    mount: Mount,
-    measurements: Measurements,
-    masks: npt.NDArray[np.bool_],
-    free: str | Sequence[str],
-    settings: FitSettings | None,
-) -> tuple[FloatArray, FieldCalibration]:
-    """Fit each mask's measurements; return the errors of all measurements under each fit, and the fits."""
-    names = resolve_free(free)
-    n = len(masks)
-    p, k = stack_mounts([mount])
-    p, k = np.repeat(p, n, axis=0), np.repeat(k, n, axis=0)
-    count = np.repeat(measurements.count[None], n, axis=0)
-    row = np.repeat(measurements.row[None], n, axis=0)
-    found = solve(p, k, count, row, masks, names, settings or FitSettings())
-    p[:, [list(PARAMETERS).index(name) for name in names]] = found.working
-    residual = _kernels.residuals_batch(p, k, count, row, np.ones_like(masks))
-    chord = np.linalg.norm(residual, axis=-1) * measurements.sigma_rad
-    return 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)), found

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rfpose.checks import FloatArray
+from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.design import Forecast, forecast, next_postures
 from rfpose.feedback.measurements import Measurements
@@ -28,6 +28,11 @@ COLUMNS = (
     "normal_sigma_mrad", "normal_with_noise_mrad",
 )  # fmt: skip
 
+_FARTHEST_M = 1e5
+_MOST_HOURS = 24.0 * 3660.0  # ten years
+_MOST_TIMES = 1_000_000
+_MOST_NEXT = 1000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
@@ -39,6 +44,8 @@ class Plan:
         Its name.
     calibrated
         Whether its mount was fitted; otherwise nothing is known of what stays uncertain.
+    noise_assumed
+        Whether the scatter about the model is not the measurements' own but what was stated of them.
     unix_s : (time,)
         Times [s since 1970 UTC].
     forecast
@@ -55,6 +62,7 @@ class Plan:
 
     heliostat: str
     calibrated: bool
+    noise_assumed: bool
     unix_s: FloatArray
     forecast: Forecast
     month_sigma_rad: FloatArray
@@ -67,6 +75,7 @@ class Plan:
         return {
             "heliostat": self.heliostat,
             "calibrated": self.calibrated,
+            "noise_assumed": self.noise_assumed,
             "commands": [dict(zip(COLUMNS, row, strict=True)) for row in _rows(self)],
             "month_sigma_mrad": (1e3 * self.month_sigma_rad).tolist(),
             "next": [
@@ -123,19 +132,35 @@ def plan_commands(
     place = site or content.site
     if place is None:
         raise InvalidInputError(f"{model}: does not say where it stands; give --site LATITUDE LONGITUDE ALTITUDE")
-    if not (hours >= 0.0 and step_s > 0.0):
-        raise InvalidInputError(
-            f"`hours` must be zero or greater and `step_s` greater than zero, got {hours}, {step_s}"
-        )
-    unix_s = unix_seconds([start])[0] + np.arange(0.0, 3600.0 * hours + 0.5 * step_s, step_s)
+    unix_s = _times(start, hours, step_s)
     names = list(heliostats) or list(content.heliostats)
     unknown = [name for name in names if name not in content.heliostats]
     if unknown:
         known = ", ".join(list(content.heliostats)[:8])
         raise InvalidInputError(f"{model}: has no heliostat {unknown[0]!r}; it has {known}")
-    goal = np.zeros(3) if target_enu_m is None else np.asarray(target_enu_m, np.float64)
+    goal = np.zeros(3) if target_enu_m is None else as_float_array("target", target_enu_m, (3,))
+    if not np.linalg.norm(goal) <= _FARTHEST_M:
+        raise InvalidInputError(f"the aim point must lie within {_FARTHEST_M / 1e3:g} km of the origin, got {goal} m")
+    if not 0 <= n_next <= _MOST_NEXT:
+        raise InvalidInputError(f"from 0 to {_MOST_NEXT} postures can be proposed, got {n_next}")
     mode: Literal["heliostat", "dish"] = "dish" if target_enu_m is None else "heliostat"
     return tuple(_plan(name, content.heliostats[name], place, unix_s, goal, mode, n_next) for name in names)
+
+
+def _times(start: str, hours: float, step_s: float) -> FloatArray:
+    """Return the times of the commands [s since 1970 UTC], as many as are sensible."""
+    if not (0.0 <= hours <= _MOST_HOURS and 0.0 < step_s < np.inf):
+        raise InvalidInputError(
+            f"the time to plan (--hours) must lie between 0 and {_MOST_HOURS:g} h and the step (--step) must be "
+            f"greater than zero seconds, got {hours:g} h, {step_s:g} s"
+        )
+    n_step = 3600.0 * hours / step_s
+    if n_step > _MOST_TIMES:
+        raise InvalidInputError(
+            f"{n_step:.3g} commands a heliostat are more than {_MOST_TIMES}; take a longer step (--step)"
+        )
+    first = unix_seconds([start])[0]
+    return np.asarray(first + np.arange(0.0, 3600.0 * hours + 0.5 * step_s, step_s))
 
 
 def _plan(
@@ -175,6 +200,7 @@ def _plan(
     return Plan(
         heliostat=name,
         calibrated=stored.calibrated,
+        noise_assumed=stored.noise_assumed,
         unix_s=unix_s,
         forecast=forecast(stored, site=site, unix_s=unix_s, target_enu_m=target, mode=mode),
         month_sigma_rad=month if stored.calibrated else np.full(12, np.nan),

@@ -2,31 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from rfpose.errors import InvalidInputError
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.alarms import Alarm, alarms
-from rfpose.feedback.calibration import Calibration, FitSettings, fit, resolve_free
+from rfpose.feedback.calibration import Calibration, FitSettings, fit, resolve_free, sun_convention
 from rfpose.feedback.measurements import Measurements, join
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import PaintHeliostat, heliostat_ids, read_heliostat
+from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
 from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
 from rfpose.pipeline.calibration_sources import Gathered
 from rfpose.pipeline.mount_file import MountFile, write_model_file
 
-__all__ = ["HeliostatReport", "calibrate_mounts", "calibrate_paint", "draw_errors", "write_models"]
+__all__ = ["Calibrations", "HeliostatReport", "calibrate_mounts", "calibrate_paint", "draw_errors", "write_models"]
 
 RECEIVER_PLANE = ("receiver_plane_up_rad", "receiver_plane_right_rad")
 RADIO_ALONE = (
     "radio sees the receivers' plane: how that lies to the mirror cannot be told without a camera, a drone or PAINT "
     "records in the same fit; the beam is off by twice whatever it is"
 )
+_FAR_RAD = 0.15
+_OVERFITTED = 1.5
+_PAINT_COUNTED = {
+    (1.0, -1.0): "from north, clockwise; PAINT's is 180° minus that",
+    (-1.0, -1.0): "from north, counter-clockwise; PAINT's is 180° more",
+    (-1.0, 1.0): "from south, west positive; PAINT's has the other sign",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +93,10 @@ class HeliostatReport:
             "skipped": dict(self.skipped),
             "fit_status": int(found.status[0]),
             "noise_mrad": 1e3 * self.calibration.noise_rad,
+            "noise_assumed": self.calibration.noise_assumed,
+            "parameters_carried": float(found.carried[0]),
+            "redundancy": float(found.redundancy[0]),
+            "choice": self._choice(),
             "median_mrad": 1e3 * float(np.nanmedian(self.calibration.error_rad)),
             "train_median_mrad": 1e3 * float(self.random.train_median_rad.mean()) if self.random else none,
             "held_out_median_mrad": 1e3 * self.held_out_median_rad,
@@ -95,13 +107,27 @@ class HeliostatReport:
             "rank": int(found.rank[0]),
             "condition": float(found.condition[0]),
             "parameters": {
-                name: {"estimate": value, "sigma": self.calibration.sigma[name]}
+                name: {"estimate": value, "sigma": self.calibration.sigma[name]} | self._prior(name)
                 for name, value in self.calibration.estimate.items()
             },
             "undetermined": [list(group) for group in self.calibration.undetermined],
             "alarms": [self._alarm(alarm) for alarm in self.alarms],
             "notes": list(self.notes),
         }
+
+    def _choice(self) -> dict[str, Any] | None:
+        choice = self.calibration.choice
+        if choice is None:
+            return None
+        return {
+            "chosen": choice.chosen,
+            "reason": choice.reason,
+            "held_out_mrad": {name: 1e3 * value for name, value in choice.held_out_rad.items()},
+        }
+
+    def _prior(self, name: str) -> dict[str, float]:
+        priors = self.calibration.settings.priors
+        return {"prior_sigma": priors[name][1]} if name in priors else {}
 
     def _alarm(self, alarm: Alarm) -> dict[str, Any]:
         first, last = self.record_names[alarm.first], self.record_names[alarm.last]
@@ -114,14 +140,41 @@ class HeliostatReport:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Calibrations(Sequence[HeliostatReport]):
+    """Reports of the heliostats that could be fitted, as a sequence, and why others could not.
+
+    Attributes
+    ----------
+    reports
+        One a heliostat.
+    skipped
+        Reason by heliostat's name.
+    """
+
+    reports: tuple[HeliostatReport, ...]
+    skipped: Mapping[str, str]
+
+    def __len__(self) -> int:
+        return len(self.reports)
+
+    @overload
+    def __getitem__(self, index: int) -> HeliostatReport: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[HeliostatReport, ...]: ...
+    def __getitem__(self, index: int | slice) -> HeliostatReport | tuple[HeliostatReport, ...]:
+        return self.reports[index]
+
+
 def calibrate_paint(
     directory: Path,
     *,
     heliostats: Sequence[str] = (),
-    free: str | Sequence[str] = "level-full",
+    free: str | Sequence[str] = AUTO,
     settings: FitSettings | None = None,
     seed: int = 0,
-) -> tuple[HeliostatReport, ...]:
+    algorithm: str = "both",
+) -> Calibrations:
     """Calibrate heliostats of a PAINT directory.
 
     Parameters
@@ -131,18 +184,73 @@ def calibrate_paint(
     heliostats
         Names; empty: all.
     free
-        Parameter set, or names.
+        ``"auto"``: as many as the records carry, chosen for each heliostat (`selection`); or a parameter set, or names.
     settings
         Of the fit.
     seed
         Of the random splits.
+    algorithm
+        As for `paint.read_heliostat`.
+
+    Raises
+    ------
+    RfposeError
+        No heliostat at all could be read and fitted.
     """
-    reports = []
-    for name in heliostats or heliostat_ids(directory):
-        data = read_heliostat(directory, name)
-        part = _Part("PAINT", _spots(data, data.record_ids.astype(np.float64)), tuple(map(str, data.record_ids)))
-        reports.append(_report(name, data.mount, data.site, [part], dict(data.skipped), free, settings, seed))
-    return tuple(reports)
+    _check_free(free)
+
+    def one(name: str) -> HeliostatReport:
+        data = read_heliostat(directory, name, algorithm=algorithm)
+        made = Measurements.from_spots(
+            data.count, sun_enu=data.sun_enu, spot_enu_m=data.spot_enu_m, unix_s=data.order_s
+        )
+        _check_paint_sun(directory / name, data, made)
+        part = _Part("PAINT", made, tuple(map(str, data.record_ids)))
+        return _report(name, data.mount, data.site, [part], dict(data.skipped), _How(free, settings, seed), data.notes)
+
+    return _each(_paint_names(directory, heliostats), one)
+
+
+def _check_free(free: str | Sequence[str]) -> None:
+    """Refuse an unknown set before anything is read."""
+    if free != AUTO:
+        try:
+            resolve_free(free)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{error}; or {AUTO}") from error
+
+
+def _paint_names(directory: Path, heliostats: Sequence[str]) -> Sequence[str]:
+    found = heliostat_ids(directory)
+    for name in heliostats:
+        if name not in found:
+            raise RecordingError(f"{directory}: no calibration records of {name!r}; known are {', '.join(found[:8])}")
+    return heliostats or found
+
+
+def _each(names: Iterable[str], one: Callable[[str], HeliostatReport]) -> Calibrations:
+    """Calibrate one after the other; who cannot be does not keep the others from it."""
+    reports, errors = [], {}
+    for name in names:
+        try:
+            reports.append(one(name))
+        except RfposeError as error:
+            errors[name] = error
+    if not reports:
+        name, first = next(iter(errors.items()))
+        others = f" ({len(errors) - 1} more could not be fitted either)" if len(errors) > 1 else ""
+        raise type(first)(f"heliostat {name}: {first}{others}") from first
+    return Calibrations(reports=tuple(reports), skipped={name: str(error) for name, error in errors.items()})
+
+
+def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> None:
+    """Refuse records whose azimuth is not counted as PAINT's, in terms of what stands in them."""
+    _, signs = sun_convention(data.mount, made)
+    if signs is not None:
+        raise RecordingError(
+            f"{folder}: the records' sun_azimuth evidently runs {_PAINT_COUNTED[signs]}: "
+            "write it as PAINT does: degrees, zero in the south, east positive"
+        )
 
 
 def calibrate_mounts(
@@ -150,10 +258,10 @@ def calibrate_mounts(
     gathered: Sequence[Gathered],
     *,
     heliostats: Sequence[str] = (),
-    free: str | Sequence[str] = "edwards-4",
+    free: str | Sequence[str] = AUTO,
     settings: FitSettings | None = None,
     seed: int = 0,
-) -> tuple[HeliostatReport, ...]:
+) -> Calibrations:
     """Calibrate mounts from whatever sources there are, all of a heliostat's in one fit.
 
     Parameters
@@ -165,7 +273,7 @@ def calibrate_mounts(
     heliostats
         Names; empty: all that were measured.
     free
-        Parameter set, or names.
+        As for `calibrate_paint`.
     settings
         Of the fit.
     seed
@@ -174,25 +282,38 @@ def calibrate_mounts(
     Raises
     ------
     InvalidInputError
-        A heliostat without a mount, or without a measurement.
+        A heliostat that is asked for has no mount, or no measurement.
+    RfposeError
+        No heliostat at all could be fitted.
     """
+    _check_free(free)
     measured = {name for source in gathered for name in source.measurements}
     skipped = {name: why for source in gathered for name, why in source.left_out.items()}
-    reports = []
-    for name in heliostats or sorted(measured):
+    for name in heliostats:
         if name not in mounts.heliostats:
-            known = ", ".join(list(mounts.heliostats)[:8])
-            raise InvalidInputError(f"heliostat {name!r} has no mount; known are {known}")
+            raise InvalidInputError(_no_mount(name, mounts))
         if name not in measured:
             raise InvalidInputError(f"heliostat {name!r} was not measured; measured were {', '.join(sorted(measured))}")
+
+    def one(name: str) -> HeliostatReport:
+        if name not in mounts.heliostats:
+            raise InvalidInputError(_no_mount(name, mounts))
         parts = []
         for source in gathered:
             if name in source.measurements:
                 made = source.measurements[name]
                 parts.append(_Part(source.source, made, tuple(f"{source.source} {i}" for i in range(len(made)))))
         mount = mounts.heliostats[name].mount
-        reports.append(_report(name, mount, mounts.site, parts, skipped, free, settings, seed))
-    return tuple(reports)
+        return _report(name, mount, mounts.site, parts, skipped, _How(free, settings, seed))
+
+    found = _each(heliostats or sorted(measured), one)
+    failed = {name: why for source in gathered for name, why in source.failed.items()}
+    return Calibrations(reports=found.reports, skipped={**failed, **found.skipped})
+
+
+def _no_mount(name: str, mounts: MountFile) -> str:
+    known = ", ".join(list(mounts.heliostats)[:8])
+    return f"heliostat {name!r} has no mount; known are {known}; add it to the file of --mount"
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +325,13 @@ class _Part:
     names: tuple[str, ...]
 
 
-def _spots(data: PaintHeliostat, order: Any) -> Measurements:
-    return Measurements.from_spots(data.count, sun_enu=data.sun_enu, spot_enu_m=data.spot_enu_m, unix_s=order)
+@dataclass(frozen=True, slots=True)
+class _How:
+    """What every heliostat of a run is fitted with."""
+
+    free: str | Sequence[str]
+    settings: FitSettings | None
+    seed: int
 
 
 def _report(
@@ -214,22 +340,23 @@ def _report(
     site: Site | None,
     parts: Sequence[_Part],
     skipped: Mapping[str, str],
-    free: str | Sequence[str],
-    settings: FitSettings | None,
-    seed: int,
+    how: _How,
+    notes: Sequence[str] = (),
 ) -> HeliostatReport:
     """Fit one heliostat and judge the fit."""
     made = join([part.measurements for part in parts])
     names = [label for part in parts for label in part.names]
     order = np.argsort(np.concatenate([part.measurements.unix_s for part in parts]), kind="stable")
     sources = {part.source: len(part.measurements) for part in parts}
-    chosen, notes = resolve_free(free), []
-    if "radio" in sources:
-        if len(sources) > 1:
-            chosen = (*chosen, *(plane for plane in RECEIVER_PLANE if plane not in chosen))
-        else:
-            notes.append(RADIO_ALONE)
-    calibration = fit(mount, made, free=chosen, settings=settings)
+    also = RECEIVER_PLANE if "radio" in sources and len(sources) > 1 else ()
+    split: dict[str, Any] = {"settings": how.settings}
+    if how.free == AUTO:
+        calibration = fit_chosen(mount, made, also=also, settings=how.settings)
+        split |= {"free": AUTO, "also": also}
+    else:
+        free = resolve_free(how.free)
+        split["free"] = (*free, *(plane for plane in also if plane not in free))
+        calibration = fit(mount, made, free=split["free"], settings=how.settings)
     return HeliostatReport(
         id=name,
         record_names=tuple(names[i] for i in order),
@@ -237,11 +364,40 @@ def _report(
         sources=sources,
         site=site,
         calibration=calibration,
-        random=_try_split(random_splits, mount, made, free=chosen, settings=settings, rng=np.random.default_rng(seed)),
-        chronological=_try_split(chronological_split, mount, made, free=chosen, settings=settings),
+        random=_try_split(random_splits, mount, made, rng=np.random.default_rng(how.seed), **split),
+        chronological=_try_split(chronological_split, mount, made, **split),
         alarms=alarms(calibration),
-        notes=tuple(notes),
+        notes=(*notes, *_notes(mount, calibration, radio_alone=set(sources) == {"radio"})),
     )
+
+
+def _notes(mount: Mount, calibration: Calibration, *, radio_alone: bool) -> list[str]:
+    """Tell what a reader must know before believing the numbers."""
+    notes = [RADIO_ALONE] if radio_alone else []
+    made, found = calibration.measurements, calibration.field
+    before, _ = sun_convention(mount, made)
+    if before > _FAR_RAD:
+        notes.append(
+            f"the mount as given is {1e3 * before:.0f} mrad off in the median; the measurements agree with each other "
+            "and were fitted: check its nominal values"
+        )
+    if calibration.noise_assumed:
+        notes.append(
+            f"{int(calibration.used.sum())} measurements carry {found.carried[0]:.1f} of {len(found.free)} parameters "
+            f"and leave {found.redundancy[0]:.1f} components to tell the noise: it rests on the stated "
+            f"{1e3 * float(np.median(made.sigma_rad)):.2g} mrad; measure more"
+        )
+    if calibration.choice is None:
+        own = held_out_sigma(mount, made, free=calibration.free, settings=calibration.settings)
+        chosen = fit_chosen(mount, made).choice
+        best = chosen.held_out_sigma if chosen else 0.0
+        if own > _OVERFITTED * best > 0.0:
+            unit = 1e3 * float(np.median(made.sigma_rad))
+            notes.append(
+                f"the measurements do not carry these {len(found.free)} parameters: time-blocks held out scatter by "
+                f"{unit * own:.2f} mrad, with auto by {unit * best:.2f}; use --parameters {AUTO}"
+            )
+    return notes
 
 
 def _try_split(split: Any, mount: Mount, made: Measurements, **how: Any) -> HeldOut | None:

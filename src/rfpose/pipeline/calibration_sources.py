@@ -7,8 +7,9 @@ their zone.
 from __future__ import annotations
 
 import csv
+import io
 import math
-import tomllib
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.checks import as_positive
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.camera.malan import Board, find_spot
 from rfpose.feedback.camera.model import spot_sigma_rad, spots_enu_m
 from rfpose.feedback.camera.spot import SpotStatus, read_picture
@@ -26,6 +28,7 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.foreign import load_toml, read_text
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.mount_file import MountFile, StoredMount
 from rfpose.pipeline.result import frame_time
@@ -35,6 +38,9 @@ __all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 
 BOARD_NAME, PICTURES_NAME = "board.toml", "pictures.csv"
 _SPOT_SIGMA_M = 0.01
+_LARGEST_TABLE_BYTES = 2**28
+_LARGEST_NUMBER = 1e12
+_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,11 +55,14 @@ class Gathered:
         By heliostat's name.
     left_out
         Why rows were left out, by what names them.
+    failed
+        Why heliostats gave nothing at all, by name.
     """
 
     source: str
     measurements: Mapping[str, Measurements]
     left_out: Mapping[str, str] = field(default_factory=dict)
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
@@ -116,7 +125,7 @@ def _nearest(entries: Any, unix_s: float, within_s: float) -> Any:
     return entries[i] if abs(entries[i, 0] - unix_s) <= within_s else None
 
 
-def read_paint(directory: Path, names: Sequence[str]) -> tuple[Gathered, MountFile]:
+def read_paint(directory: Path, names: Sequence[str], *, algorithm: str = "both") -> tuple[Gathered, MountFile]:
     """Take PAINT records to be fitted together with other sources, and the mounts as built.
 
     Parameters
@@ -125,23 +134,29 @@ def read_paint(directory: Path, names: Sequence[str]) -> tuple[Gathered, MountFi
         With the heliostats' folders and the tower's.
     names
         Heliostats; empty: all.
+    algorithm
+        As for `paint.read_heliostat`.
     """
     made, mounts = {}, {}
     left_out: dict[str, str] = {}
+    failed: dict[str, str] = {}
     site = None
     for name in names or heliostat_ids(directory):
-        data = read_heliostat(directory, name)
-        timed = np.isfinite(data.unix_s).all()
+        try:
+            data = read_heliostat(directory, name, algorithm=algorithm)
+        except RfposeError as error:
+            failed[name] = str(error)
+            continue
         made[name] = Measurements.from_spots(
-            data.count,
-            sun_enu=data.sun_enu,
-            spot_enu_m=data.spot_enu_m,
-            unix_s=data.unix_s if timed else data.record_ids.astype(np.float64),
+            data.count, sun_enu=data.sun_enu, spot_enu_m=data.spot_enu_m, unix_s=data.order_s
         )
         mounts[name] = StoredMount(mount=data.mount)
         left_out |= {f"{name} record {number}": why for number, why in data.skipped.items()}
         site = data.site
-    return Gathered(source="PAINT", measurements=made, left_out=left_out), MountFile(heliostats=mounts, site=site)
+    if not made:
+        raise RecordingError(f"{directory}: no heliostat can be used: {next(iter(failed.values()))}")
+    gathered = Gathered(source="PAINT", measurements=made, left_out=left_out, failed=failed)
+    return gathered, MountFile(heliostats=mounts, site=site)
 
 
 def read_drone(path: Path, mounts: Mapping[str, Mount]) -> Gathered:
@@ -217,17 +232,12 @@ def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) ->
 
 def _board(path: Path) -> tuple[list[float], list[float], Board, float]:
     """Place and shape of the target."""
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordingError(
-            f"{path}: is missing; it says where the target stands and where its markers are"
-        ) from error
-    except ValueError as error:
-        raise RecordingError(f"{path}: is no TOML ({error})") from error
+    if not path.exists():
+        raise RecordingError(f"{path}: is missing; it says where the target stands and where its markers are")
+    table = load_toml(path)
     try:
         centre, normal = table.pop("centre_enu_m"), table.pop("normal_enu")
-        sigma = float(table.pop("spot_sigma_m", _SPOT_SIGMA_M))
+        sigma = as_positive("spot_sigma_m", table.pop("spot_sigma_m", _SPOT_SIGMA_M))
         board = Board(**{key: _tuples(value) for key, value in table.items()})
     except KeyError as error:
         raise RecordingError(f"{path}: {error} is missing") from error
@@ -258,10 +268,15 @@ class _Row:
     text: Mapping[str, str]
 
     def number(self, name: str) -> float:
+        text = self.text[name].strip()
         try:
-            return float(self.text[name])
+            value = float(text)
         except ValueError as error:
-            raise RecordingError(f"{self.place}: {name} must be a number, got {self.text[name]!r}") from error
+            hint = "; write decimals with a point" if re.fullmatch(r"[+-]?\d+,\d+", text) else ""
+            raise RecordingError(f"{self.place}: {name} must be a number, got {text!r:.40}{hint}") from error
+        if not abs(value) <= _LARGEST_NUMBER:
+            raise RecordingError(f"{self.place}: {name} must lie within ±{_LARGEST_NUMBER:g}, got {text!r:.40}")
+        return value
 
     @property
     def unix_s(self) -> float:
@@ -273,15 +288,26 @@ class _Row:
 
 def _rows(path: Path, names: Sequence[str]) -> list[_Row]:
     """Lines of a CSV file that has certain columns."""
+    text = read_text(path, limit=_LARGEST_TABLE_BYTES)
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in names if name not in (reader.fieldnames or ())]
-            if missing:
-                raise RecordingError(f"{path}: has no column {missing[0]}; needed are {', '.join(names)}")
-            rows = [_Row(f"{path} line {reader.line_num}", {k: v or "" for k, v in row.items() if k}) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}: cannot be read as CSV ({error})") from error
+        reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+        found = [name.strip() for name in reader.fieldnames or ()]
+        missing = [name for name in names if name not in found]
+        if missing:
+            header = text.lstrip().partition("\n")[0]
+            separator = next((words for mark, words in _SEPARATORS.items() if mark in header), None)
+            raise RecordingError(
+                f"{path}: its columns have {separator} between; save it with commas, and decimals with a point"
+                if separator
+                else f"{path}: has no column {missing[0]}; needed are {', '.join(names)}"
+            )
+        reader.fieldnames = found
+        rows = [
+            _Row(f"{path} line {reader.line_num}", {k: v.strip() if v else "" for k, v in row.items() if k})
+            for row in reader
+        ]
+    except csv.Error as error:
+        raise RecordingError(f"{path}: cannot be read as CSV ({error}); save it again") from error
     if not rows:
         raise RecordingError(f"{path}: holds no line below its header")
     return rows

@@ -8,7 +8,6 @@ well as what was fitted.
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -20,15 +19,17 @@ import tomli_w
 from rfpose import __version__
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.feedback.calibration import Known
-from rfpose.feedback.mount import Actuator, Mount, check_names
-from rfpose.feedback.sun import Site
+from rfpose.feedback.calibrated import Choice, Known, resolve_free
+from rfpose.feedback.mount import Actuator, Mount
+from rfpose.feedback.sun import Site, site_from_degrees
+from rfpose.foreign import load_json, load_toml
 from rfpose.pipeline.files import refuse_existing, write_atomically
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "is_model", "read_models", "write_model_file"]
 
 MODEL_FORMAT = "rfpose-mount"
 MODEL_VERSION = 1
+_LARGEST_BYTES = 2**28  # ten thousand calibrated heliostats are 100 MB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +48,10 @@ class StoredMount:
         Likewise.
     noise_rad
         Scatter of one normal, one component, about the model [rad]; NaN if unknown.
+    noise_assumed
+        It rests on the measurements' stated sigma, for want of redundant ones.
+    choice
+        How its parameters were chosen; None where they were given.
     undetermined
         Groups of parameters that the data could not tell apart.
     """
@@ -57,6 +62,8 @@ class StoredMount:
     ambiguity: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     column_length: FloatArray = field(default_factory=lambda: np.zeros(0))
     noise_rad: float = float("nan")
+    noise_assumed: bool = False
+    choice: Choice | None = None
     undetermined: tuple[tuple[str, ...], ...] = ()
 
     @property
@@ -161,8 +168,16 @@ def _as_table(known: Known, undetermined: tuple[tuple[str, ...], ...]) -> dict[s
             "ambiguity": known.ambiguity.tolist(),
             "column_length": known.column_length.tolist(),
             "noise_rad": known.noise_rad,
+            "noise_assumed": known.noise_assumed,
             "undetermined": [list(group) for group in undetermined],
         }
+        if known.choice is not None:
+            table["choice"] = {
+                "chosen": known.choice.chosen,
+                "reason": known.choice.reason,
+                "held_out_rad": dict(known.choice.held_out_rad),
+                "held_out_sigma": known.choice.held_out_sigma,
+            }
         for group in undetermined:
             for name in group:
                 table["sigma"].pop(name, None)
@@ -192,29 +207,28 @@ def read_models(path: str | Path) -> MountFile:
         raise RecordingError(f"{path}: is no {MODEL_FORMAT} file; give what `rfpose calibrate -o` wrote")
     version = content.get("version")
     if version != MODEL_VERSION:
-        raise RecordingError(f"{path}: has version {version!r}, this rfpose reads {MODEL_VERSION}; update rfpose")
+        raise RecordingError(f"{path}: has version {version!r:.40}, this rfpose reads {MODEL_VERSION}; update rfpose")
     tables = content.get("heliostat")
     if not isinstance(tables, Mapping) or not tables:
         raise RecordingError(f"{path}: names no heliostat; add a table [heliostat.NAME] with pivot_enu_m")
+    made_by = content.get("made_by", {})
+    if not isinstance(made_by, Mapping):
+        raise RecordingError(f"{path}: made_by must be a table, got {made_by!r:.40}")
     heliostats = {}
     for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            raise RecordingError(f"{path}: heliostat {name}: must be a table with pivot_enu_m, got {table!r:.40}")
         try:
             heliostats[str(name)] = _from_table(table)
         except (InvalidInputError, TypeError, ValueError, KeyError, AttributeError) as error:
             text = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise RecordingError(f"{path}: heliostat {name}: {text}") from error
-    return MountFile(heliostats=heliostats, site=_site(path, content.get("site")), made_by=content.get("made_by", {}))
+    return MountFile(heliostats=heliostats, site=_site(path, content.get("site")), made_by=made_by)
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: cannot be read as text ({error}); give a .json or .toml file") from error
-    try:
-        content = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except ValueError as error:
-        raise RecordingError(f"{path}: is neither JSON nor TOML by its ending ({error})") from error
+    load = load_toml if path.suffix == ".toml" else load_json
+    content = load(path, limit=_LARGEST_BYTES, remedy="give what `rfpose calibrate -o` wrote, .json or .toml")
     if not isinstance(content, dict):
         raise RecordingError(f"{path}: must hold one object, got a {type(content).__name__}")
     return content
@@ -223,6 +237,7 @@ def _load(path: Path) -> dict[str, Any]:
 def _from_table(table: Mapping[str, Any]) -> StoredMount:
     known = {"pivot_enu_m", "rot_enu_from_mount", "actuators", "parameters"}
     fitted = {"free", "sigma", "covariance", "ambiguity", "column_length", "noise_rad", "undetermined"}
+    fitted |= {"noise_assumed", "choice"}
     unknown = [key for key in table if key not in known | fitted]
     if unknown:
         raise InvalidInputError(f"no key is called {unknown[0]!r}; known are {', '.join(sorted(known | fitted))}")
@@ -240,17 +255,60 @@ def _from_table(table: Mapping[str, Any]) -> StoredMount:
     )
     if not table.get("free"):
         return StoredMount(mount=mount)
-    free = tuple(table["free"])
-    check_names(free)
+    free = resolve_free(table["free"])
     n = len(free)
+    covariance = as_float_array("covariance", table["covariance"], (n, n))
+    ambiguity = as_float_array("ambiguity", table["ambiguity"], (n, n))
+    length = as_float_array("column_length", table["column_length"], (n,))
+    for name, square in (("covariance", covariance), ("ambiguity", ambiguity)):
+        if not _could_be_covariance(square):
+            raise InvalidInputError(f"`{name}` must be symmetric, without a negative variance; calibrate again")
+    if np.any(length < 0.0):
+        raise InvalidInputError(f"`column_length` must be zero or greater, got {length.min()}")
+    assumed = table.get("noise_assumed", False)
+    if not isinstance(assumed, bool):
+        raise InvalidInputError(f"`noise_assumed` must be true or false, got {assumed!r:.40}")
     return StoredMount(
         mount=mount,
         free=free,
-        covariance=read_only(as_float_array("covariance", table["covariance"], (n, n))),
-        ambiguity=read_only(as_float_array("ambiguity", table["ambiguity"], (n, n))),
-        column_length=read_only(as_float_array("column_length", table["column_length"], (n,))),
-        noise_rad=float(table["noise_rad"]),
+        covariance=read_only(covariance),
+        ambiguity=read_only(ambiguity),
+        column_length=read_only(length),
+        noise_rad=_not_negative("noise_rad", table["noise_rad"]),
+        noise_assumed=assumed,
+        choice=_stored_choice(table.get("choice"), free),
         undetermined=tuple(tuple(group) for group in table.get("undetermined", ())),
+    )
+
+
+def _could_be_covariance(square: FloatArray) -> bool:
+    """Whether a matrix is symmetric and has no negative variance, in units in which its diagonal is one."""
+    diagonal = np.diag(square)
+    if np.any(diagonal < 0.0):
+        return False
+    unit = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = square / unit[:, None] / unit
+    return bool(np.allclose(scaled, scaled.T, atol=1e-6) and np.abs(scaled).max() < 1.0 + 1e-6)
+
+
+def _not_negative(name: str, value: Any) -> float:
+    number = float(as_float_array(name, value, ()))
+    if number < 0.0:
+        raise InvalidInputError(f"`{name}` must be zero or greater, got {number}")
+    return number
+
+
+def _stored_choice(table: Any, free: tuple[str, ...]) -> Choice | None:
+    if table is None:
+        return None
+    if not isinstance(table, Mapping) or not isinstance(table.get("held_out_rad"), Mapping):
+        raise InvalidInputError(f"`choice` must be a table with chosen, reason, held_out_rad, got {table!r:.40}")
+    return Choice(
+        chosen=str(table["chosen"]),
+        free=free,
+        held_out_rad={str(k): _not_negative(f"held_out_rad.{k}", v) for k, v in table["held_out_rad"].items()},
+        held_out_sigma=_not_negative("held_out_sigma", table["held_out_sigma"]),
+        reason=str(table["reason"]),
     )
 
 
@@ -258,10 +316,8 @@ def _site(path: Path, table: Any) -> Site | None:
     if table is None:
         return None
     try:
-        return Site(
-            latitude_rad=float(np.radians(table["latitude_deg"])),
-            longitude_rad=float(np.radians(table["longitude_deg"])),
-            altitude_m=float(table.get("altitude_m", 0.0)),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        return site_from_degrees(table["latitude_deg"], table["longitude_deg"], table.get("altitude_m", 0.0))
+    except InvalidInputError as error:
+        raise RecordingError(f"{path}: [site]: {error}") from error
+    except (KeyError, TypeError, AttributeError) as error:
         raise RecordingError(f"{path}: [site] needs latitude_deg and longitude_deg, as numbers ({error})") from error
