@@ -16,9 +16,13 @@ from rfpose.geometry import enu_from_azimuth_elevation
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
+from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.layout import Rules, budget_layout, map_layout, optimise_layout
 from rfpose.pipeline.layout.site import Postures
-from rfpose.scenario import load_scenario
+from rfpose.pipeline.process import process
+from rfpose.pipeline.result_summary import summarise as summarise_result
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.scenario import check_scenario, load_scenario
 
 SITE = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 
@@ -36,7 +40,7 @@ def test_map_writes_json_csv_and_picture(tmp_path):
     )
     assert found["heliostats"] == 12
     assert found["postures"] == 2
-    assert set(found["normal_mrad"]) == set(ESTIMATORS)
+    assert set(found["normal_mrad"]) == {"scenario", *ESTIMATORS}
     assert found["normal_mrad"]["shared-clock"]["rms"] < found["normal_mrad"]["rigid"]["rms"]
     lost = found["normal_without_transmitter_mrad"]["rigid"]
     assert min(lost.values()) > found["normal_mrad"]["rigid"]["rms"]
@@ -46,6 +50,58 @@ def test_map_writes_json_csv_and_picture(tmp_path):
     rms = np.sqrt(np.mean([float(row["normal_rigid_rms_mrad"]) ** 2 for row in rows]))
     assert rms == pytest.approx(found["normal_mrad"]["rigid"]["rms"], rel=1e-4)
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def short_site(tmp_path, **changes):
+    """Table 2's field in short frames; ``changes`` by table."""
+    data = load_scenario(SITE).model_dump(exclude_none=True)
+    data["radio"]["frame_samples"] = 8000
+    for table, keys in changes.items():
+        data[table] = {**data.get(table, {}), **keys} if isinstance(keys, dict) else keys
+    site = tmp_path / "site.toml"
+    site.write_text(check_scenario(data).to_toml())
+    return site
+
+
+def test_the_scenarios_own_estimator_is_that_of_process(tmp_path):
+    """Map and evaluation of one scenario, frames standing still: the same bound, by two independent ways."""
+    for mirror in ({}, {"pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 2e-12}, {"oscillator": "separate"}):
+        heliostats = [{**h.model_dump(exclude_none=True), **mirror} for h in load_scenario(SITE).heliostat[:3]]
+        still = {"frame_count": 2, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0, "sample_format": "complex64"}
+        tones = [{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}]
+        site = short_site(tmp_path, heliostat=heliostats, simulation=still, tone=tones)
+        recording, result = tmp_path / "rec.h5", tmp_path / "result.h5"
+        simulate_recording(site, recording, seed=1, force=True)
+        bound = evaluate(process(recording, result, estimator="correlator", force=True)).bound_mrad
+        found = map_layout(site)
+        assert found.posture_names == ("simulated sun",)
+        assert found.as_dict()["normal_mrad"]["scenario"]["rms"] == pytest.approx(bound, rel=1e-3)
+
+
+def test_a_site_about_frequency_zero_has_no_carriers_to_compare(tmp_path):
+    site = short_site(tmp_path, radio={"centre_frequency_hz": 0.0})
+    found = json.loads(run("map", site, "--json"))["normal_mrad"]
+    assert set(found) == {"scenario", "independent", "rigid", "shared-clock", "pivot"}
+    assert found["scenario"]["rms"] == pytest.approx(found["rigid"]["rms"])
+    with pytest.raises(ScenarioError, match=r"site\.toml: estimator `carrier` .* set `radio.centre_frequency_hz`"):
+        map_layout(site, estimators=["carrier"])
+    with pytest.raises(ScenarioError, match=r"site\.toml: estimator `reflection` needs a ground"):
+        map_layout(site, estimators=["reflection"])
+    recording, result = tmp_path / "rec.h5", tmp_path / "result.h5"
+    simulate_recording(site, recording, seed=1)
+    measured = process(recording, result, estimator="correlator")
+    assert measured.poses.n_wavelength.max() == 1
+    assert list(summarise_result(measured)["integers"]) == ["0.75 MHz"]
+    assert evaluate(measured).ratio_to_bound == pytest.approx(1.0, abs=0.3)
+
+
+def test_mirrors_that_differ_have_each_its_own_estimator(tmp_path):
+    heliostats = [h.model_dump(exclude_none=True) for h in load_scenario(SITE).heliostat[:2]]
+    heliostats[1]["oscillator"] = "separate"
+    both = map_layout(short_site(tmp_path, heliostat=heliostats), sensitivity=True)
+    each = [map_layout(short_site(tmp_path, heliostat=[h])).rms_mrad["scenario"][0] for h in heliostats]
+    np.testing.assert_allclose(both.rms_mrad["scenario"], each)
+    assert each[1] > 10.0 * each[0]
 
 
 def test_map_of_a_field_from_csv(tmp_path):

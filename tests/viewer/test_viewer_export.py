@@ -10,6 +10,7 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from PySide6.QtCore import QRect
@@ -46,6 +47,39 @@ def test_each_view_becomes_a_picture(qapp, files: dict[str, Path], tmp_path: Pat
     assert picture.width() > 800
     colours = {picture.pixel(x, y) for x in range(0, picture.width(), 3) for y in range(0, picture.height(), 3)}
     assert len(colours) > 20
+
+
+def test_shown_bounds_are_those_of_the_commands(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+    """One posture and one estimator for a scenario's figures, wherever they are shown."""
+    found = CliRunner().invoke(_app.app, ["layout", "map", str(files["scenario"]), "--json"])
+    mapped = json.loads(found.stdout)["normal_mrad"]
+    for kind in ("scenario", "result"):
+        _, window = export.open_window(files[kind])
+        view = window.views["layout"]
+        for name in ("scenario", "independent", "carrier"):
+            assert window.session.layout is not None
+            window.session.layout.choose(estimator=name)
+            export.settle(qapp, window)
+            assert view.map.rms_mrad == pytest.approx(mapped[name]["rms"], rel=1e-12)
+            assert f"rms <b>{mapped[name]['rms']:.4g}</b> mrad" in view.figures.text()
+        window.session.layout.choose(estimator="scenario")
+        export.settle(qapp, window)
+        said = view.figures.text()
+        assert "a clock a receiver, with the carrier; posture: reflecting the simulated sun" in said
+        window.close()
+    _, window = export.open_window(files["scenario"])
+    shown = window.session.document.field.normal_enu[0]
+    np.testing.assert_allclose(shown, open_recording(files["recording"]).truth.normal_enu[0], atol=1e-12)
+    window.close()
+    evaluated = json.loads(CliRunner().invoke(_app.app, ["evaluate", str(files["result"]), "--json"]).stdout)
+    report = tmp_path / "report.html"
+    assert run(files["result"], "--save", report).exit_code == 0
+    row = re.search(r"mirror normal \[mrad\](.*?)</tr>", report.read_text())
+    cells = re.findall(r"<td class=n>([^<]*)</td>", row[1])
+    told = [*evaluated["normal_error_mrad"].values(), evaluated["bound_mrad"]["rms"]]
+    assert cells == [f"{value:.4g}" for value in told]
+    # the bound of the layout on the same page: of the first frame, the same solver
+    assert mapped["scenario"]["rms"] == pytest.approx(evaluated["bound_mrad"]["rms"], rel=0.1)
 
 
 def test_svg_holds_text_that_can_be_read(qapp, files: dict[str, Path], tmp_path: Path) -> None:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.scenario import Scenario, check_scenario
 
-__all__ = ["cornfield", "radial_staggered", "read_positions"]
+__all__ = ["cornfield", "radial_staggered", "read_positions", "with_field"]
 
 _COLUMNS = ("east_m", "north_m", "up_m")
 _COINCIDENT_M = 1e-3
@@ -66,6 +69,34 @@ def read_positions(path: str | Path) -> tuple[tuple[str, ...], FloatArray]:
         i, j = pairs[0]
         raise ScenarioError(f"{path}: heliostats `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one")
     return tuple(ids), pivot
+
+
+def with_field(scenario: Scenario, ids: Sequence[str], pivot_enu_m: npt.ArrayLike) -> Scenario:
+    """Return a scenario with another field, each heliostat like the first, its own posture left out.
+
+    Impairments of receivers are left out, too, since they name those of the old field.
+
+    Raises
+    ------
+    ScenarioError
+        No heliostat whose mirror could be taken; a name that no heliostat may have, or twice.
+    """
+    if not scenario.heliostat:
+        raise ScenarioError(
+            f"scenario `{scenario.name}` has no heliostat whose mirror the field could have; add a [[heliostat]]"
+        )
+    like = scenario.heliostat[0].model_dump(exclude_none=True)
+    like.pop("normal_enu", None)
+    n_receiver = len(scenario.heliostat[0].receiver_mirror_m)
+    data = scenario.model_dump(exclude_none=True)
+    data["heliostat"] = [
+        {**like, "id": name, "pivot_enu_m": tuple(place), "receiver_ids": [f"{name}_r{k}" for k in range(n_receiver)]}
+        for name, place in zip(ids, np.asarray(pivot_enu_m).tolist(), strict=True)
+    ]
+    simulation = data.get("simulation", {})
+    simulation.pop("blocked", None)
+    simulation.pop("dropped", None)
+    return check_scenario(data)
 
 
 def _check_header(path: Path, header: list[str]) -> None:

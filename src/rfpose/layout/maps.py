@@ -6,7 +6,8 @@ measured. All angles are of the mirror normal; the beam turns by twice as much.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numba
 import numpy as np
@@ -17,24 +18,33 @@ from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.dsp.bounds import phase_bound_rad
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout import _kernels
-from rfpose.scenario import Scenario
+from rfpose.scenario import Heliostat, Scenario
 
 __all__ = [
     "ESTIMATORS",
+    "SCENARIO",
     "Dilution",
     "Estimator",
     "Mirrors",
     "Noise",
+    "Study",
     "check_site",
     "dilution",
     "disc_points",
+    "estimator_of",
+    "estimators_of",
+    "in_words",
     "mirrors_facing",
     "mirrors_of",
     "noise_of",
     "normal_map",
     "normal_without_each",
+    "posture_name",
+    "study_of",
     "summarise",
 ]
+
+IndexArray = npt.NDArray[np.int64]
 
 _COINCIDENT_M = 1e-6
 _FLAT = 1e-6
@@ -60,6 +70,8 @@ class Estimator:
         Survey of the pivot in each axis; infinity: unknown [m].
     two_axis, roll_sigma_rad
         An azimuth-elevation mount keeps the mirror's x axis horizontal this well.
+    clock_a_tone
+        Each tone has clocks of its own, since filters delay tones differently; else all tones have them in common.
     """
 
     name: str
@@ -69,6 +81,7 @@ class Estimator:
     pivot_sigma_m: float = np.inf
     two_axis: bool = False
     roll_sigma_rad: float = 1e-6
+    clock_a_tone: bool = False
 
     def __post_init__(self) -> None:
         if not self.clock_sigma_m >= 0.0:
@@ -78,6 +91,9 @@ class Estimator:
         if not self.roll_sigma_rad > 0.0:
             raise InvalidInputError(f"`roll_sigma_rad` must be greater than zero, got {self.roll_sigma_rad}")
 
+
+SCENARIO = "scenario"
+"""Name of the estimator that a scenario describes; see `estimator_of`."""
 
 ESTIMATORS = {
     e.name: e
@@ -143,6 +159,15 @@ class Mirrors:
     rot_enu_from_mirror: FloatArray
     receiver_mirror_m: FloatArray
 
+    def rows(self, index: IndexArray) -> Mirrors:
+        """Return some of the mirrors."""
+        places = self.receiver_mirror_m
+        return Mirrors(
+            pivot_enu_m=self.pivot_enu_m[index],
+            rot_enu_from_mirror=self.rot_enu_from_mirror[index],
+            receiver_mirror_m=places if len(places) == 1 else places[index],
+        )
+
     @property
     def normal_enu(self) -> FloatArray:
         """(mirror, xyz) unit normals."""
@@ -153,6 +178,44 @@ class Mirrors:
         """(mirror, receiver, xyz) [m]."""
         places = np.broadcast_to(self.receiver_mirror_m, (len(self.pivot_enu_m), *self.receiver_mirror_m.shape[1:]))
         return np.asarray(self.pivot_enu_m[:, None] + np.einsum("mab,mrb->mra", self.rot_enu_from_mirror, places))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study:
+    """How a site's normals are made: which estimator for which of its mirrors, and the noise; see `study_of`.
+
+    Attributes
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    noise
+        Of the phases.
+    rows : estimator to (mirror,)
+        Which mirrors each is for.
+    """
+
+    transmitter_enu_m: FloatArray
+    noise: Noise
+    rows: dict[Estimator, IndexArray]
+
+    def bound(self, mirrors: Mirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
+        """Return the bound of each mirror's normal (mirror,) [rad]; as `normal_map`."""
+        seen = None if visible is None else np.asarray(visible)
+        out = np.full(len(mirrors.pivot_enu_m), np.nan)
+        for estimator, rows in self.rows.items():
+            part = None if seen is None else seen[rows]
+            out[rows] = normal_map(self.transmitter_enu_m, mirrors.rows(rows), self.noise, estimator, visible=part)
+        return out
+
+    def without_each(self, mirrors: Mirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
+        """Return it with each transmitter lost in turn (transmitter, mirror) [rad]; as `normal_without_each`."""
+        seen = None if visible is None else np.asarray(visible)
+        out = np.full((len(self.transmitter_enu_m), len(mirrors.pivot_enu_m)), np.nan)
+        for estimator, rows in self.rows.items():
+            part = None if seen is None else seen[rows]
+            place, mine = self.transmitter_enu_m, mirrors.rows(rows)
+            out[:, rows] = normal_without_each(place, mine, self.noise, estimator, visible=part)
+        return out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -310,7 +373,8 @@ def normal_map(
         return np.asarray(np.sqrt(out))
     shared = estimator.clock_sigma_m == 0.0
     roll_info = estimator.roll_sigma_rad**-2 if estimator.two_axis else 0.0
-    calibrated = not estimator.carrier and not np.any(noise.calibration_sigma_m > 0.0)
+    one_clock = not (estimator.clock_a_tone and len(noise.tone_sigma_m) > 1)
+    calibrated = one_clock and not estimator.carrier and not np.any(noise.calibration_sigma_m > 0.0)
     if calibrated and (shared or np.isinf(estimator.clock_sigma_m)):
         _kernels.tilt_calibrated(
             field_seen, (noise.tone_sigma_m**-2.0).sum(axis=0), shared, estimator.pivot_sigma_m**-2, roll_info,
@@ -322,7 +386,7 @@ def normal_map(
     if not shared and np.isfinite(estimator.clock_sigma_m):
         tie = 1.0 / (n_receiver * estimator.clock_sigma_m**2)
     _kernels.tilt_rigid(
-        field_seen, weight, bias_info, group_class, 2 if estimator.carrier else 1, shared, tie,
+        field_seen, weight, bias_info, group_class, int(group_class[-1]) + 1, shared, tie,
         estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
     )  # fmt: skip
     return np.asarray(np.sqrt(out))
@@ -349,7 +413,7 @@ def _groups(noise: Noise, estimator: Estimator) -> tuple[FloatArray, FloatArray,
     weight = noise.tone_sigma_m**-2.0
     with np.errstate(divide="ignore"):
         bias_info = noise.calibration_sigma_m**-2.0
-    group_class = np.zeros(len(weight), np.int64)
+    group_class = np.arange(len(weight)) if estimator.clock_a_tone else np.zeros(len(weight), np.int64)
     if not estimator.carrier:
         return weight, bias_info, group_class
     if noise.carrier_sigma_m is None:
@@ -358,7 +422,7 @@ def _groups(noise: Noise, estimator: Estimator) -> tuple[FloatArray, FloatArray,
     return (
         np.concatenate([weight, carrier]),
         np.concatenate([bias_info, np.zeros_like(carrier)]),
-        np.append(group_class, 1),
+        np.append(group_class, group_class[-1] + 1),
     )
 
 
@@ -472,8 +536,8 @@ def mirrors_of(
 ) -> Mirrors:
     """Return a scenario's mirrors in a posture.
 
-    With the given normal; else facing the aim point under the given sun; else with each heliostat's own
-    ``normal_enu``, and level where it has none.
+    With the given normal; else facing the aim point under the given sun; else as the scenario says
+    (`Scenario.posture_enu`), and level where it says nothing; `posture_name` tells which.
 
     Raises
     ------
@@ -490,12 +554,96 @@ def mirrors_of(
     if (places == places[0]).all():
         places = places[:1]
     if normal_enu is None and sun_enu is None:
-        normal_enu = np.array([h.normal_enu or (0.0, 0.0, 1.0) for h in scenario.heliostat])
+        normal_enu = np.array(scenario.posture_enu)
+        if scenario.simulated_sun_enu is None:
+            normal_enu[~np.isfinite(normal_enu).all(axis=1)] = [0.0, 0.0, 1.0]
     if normal_enu is None and scenario.site.aim_enu_m is None:
         raise InvalidInputError("[site] `aim_enu_m` is missing: the mirrors have nothing to face; add it, or a normal")
     return mirrors_facing(
         scenario.pivot_enu_m, places, normal_enu=normal_enu, aim_enu_m=scenario.site.aim_enu_m, sun_enu=sun_enu
     )
+
+
+def posture_name(scenario: Scenario) -> str:
+    """Return where `mirrors_of` takes the mirrors' posture from: their own normals, the simulated sun, or level."""
+    if any(h.normal_enu is not None for h in scenario.heliostat):
+        return "own"
+    return "level" if scenario.simulated_sun_enu is None else "simulated sun"
+
+
+def estimator_of(scenario: Scenario, heliostat: Heliostat) -> Estimator:
+    """Return how `rfpose process` makes a heliostat's normal by pose rigid: its clocks, carrier, pivot and mount.
+
+    Reflections, and delays that are learned over frames, are not in it.
+    """
+    clock = np.inf
+    if heliostat.oscillator == "shared" and heliostat.receiver_delay_sigma_s is not None:
+        clock = heliostat.receiver_delay_sigma_s * scenario.radio.propagation_speed_mps
+    return Estimator(
+        name=SCENARIO,
+        clock_sigma_m=clock,
+        carrier=scenario.compares_carriers(heliostat),
+        pivot_sigma_m=np.inf if heliostat.pivot_sigma_m is None else heliostat.pivot_sigma_m,
+        two_axis=heliostat.mount == "azimuth_elevation",
+        clock_a_tone=True,
+    )
+
+
+def estimators_of(scenario: Scenario, heliostats: Sequence[Heliostat] | None = None) -> dict[Estimator, IndexArray]:
+    """Return the scenario's own estimators, and which of its (or of these) heliostats each is for."""
+    found: dict[Estimator, list[int]] = {}
+    for i, heliostat in enumerate(scenario.heliostat if heliostats is None else heliostats):
+        found.setdefault(estimator_of(scenario, heliostat), []).append(i)
+    return {estimator: np.array(rows, np.int64) for estimator, rows in found.items()}
+
+
+def study_of(
+    scenario: Scenario,
+    name: str,
+    *,
+    heliostats: Sequence[Heliostat] | None = None,
+    tone_snr_db: float | None = None,
+) -> Study:
+    """Return what maps of a scenario need for an estimator by name: one of `ESTIMATORS`, or `SCENARIO`.
+
+    ``heliostats`` are studied instead of the scenario's, so that a site need not be checked anew at each move.
+    Without calibration receivers the transmitters' electronic phases count as known for the former estimators, and as
+    unknown for the latter.
+
+    Raises
+    ------
+    GeometryError
+        The estimator needs carriers where there are none.
+    """
+    heliostats = scenario.heliostat if heliostats is None else heliostats
+    noise = noise_of(scenario, tone_snr_db=tone_snr_db)
+    if name == SCENARIO:
+        if not scenario.calibration_receiver:
+            noise = replace(noise, calibration_sigma_m=read_only(np.full_like(noise.tone_sigma_m, np.inf)))
+        return Study(
+            transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows=estimators_of(scenario, heliostats)
+        )
+    estimator = ESTIMATORS[name]
+    if estimator.carrier and not scenario.has_rf_carriers:
+        raise GeometryError(
+            f"estimator `{name}` compares carriers, and not all of their radio frequencies are above zero: set "
+            "`radio.centre_frequency_hz`, or choose another estimator"
+        )
+    everything = np.arange(len(heliostats))
+    return Study(transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows={estimator: everything})
+
+
+def in_words(estimator: Estimator, propagation_speed_mps: float) -> str:
+    """Return what an estimator uses, for tables and pictures."""
+    if not estimator.rigid:
+        return "each receiver located on its own"
+    words = ["a clock a receiver" if np.isinf(estimator.clock_sigma_m) else "one clock a mirror"]
+    if 0.0 < estimator.clock_sigma_m < np.inf:
+        words[0] = f"delays known to {1e12 * estimator.clock_sigma_m / propagation_speed_mps:.3g} ps"
+    words.append("with the carrier" if estimator.carrier else "without the carrier")
+    if np.isfinite(estimator.pivot_sigma_m):
+        words.append(f"pivots to {1e3 * estimator.pivot_sigma_m:.3g} mm")
+    return ", ".join(words + (["two-axis mount"] if estimator.two_axis else []))
 
 
 def check_clear(scenario: Scenario) -> None:
@@ -540,10 +688,10 @@ def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
     n_sample = scenario.radio.frame_samples
     tone = scenario.wavelength_m[:, None] / (2.0 * np.pi) * phase_bound_rad(n_sample, snr)
     carrier_snr = 2.0 * snr_first * (amplitude / index[0]) ** 2
-    rf_hz = scenario.radio.centre_frequency_hz + scenario.carrier_hz
     carrier = None
-    if np.all(rf_hz > 0.0):
-        carrier = scenario.radio.propagation_speed_mps / (2.0 * np.pi * rf_hz) * phase_bound_rad(n_sample, carrier_snr)
+    if scenario.has_rf_carriers:
+        per_rad = scenario.radio.propagation_speed_mps / (2.0 * np.pi * scenario.carrier_rf_hz)
+        carrier = per_rad * phase_bound_rad(n_sample, carrier_snr)
     free = plan.path_loss == "free_space"
     calibration = np.zeros_like(tone)
     if scenario.calibration_receiver:

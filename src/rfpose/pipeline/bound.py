@@ -18,7 +18,6 @@ from rfpose.pipeline.choice import PoseChoice, reflectors_of
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
     calibration_sight,
-    carrier_rf_hz,
     group_hz,
     is_calibrated,
     mirror_groups,
@@ -136,7 +135,7 @@ def _rigid(
             sigma_m=sigma[rows],
             transmitter_sigma_m=common[rows],
             clock_class=classes,
-            carrier_rf_hz=carrier_rf_hz(scenario),
+            carrier_rf_hz=scenario.carrier_rf_hz,
             tone_hz=group_hz(scenario, group),
             reflectors=reflectors,
             coefficient=[complex(c) for c in truth],
@@ -160,7 +159,7 @@ def _range_noise(scenario: Scenario, noise: PhaseNoise, group: MirrorGroup) -> t
         else:
             common.append(np.full((n, len(scenario.transmitter)), np.inf))
     if group.uses_carrier:
-        to_m = scenario.radio.propagation_speed_mps / carrier_rf_hz(scenario) / (2.0 * np.pi)
+        to_m = scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz / (2.0 * np.pi)
         sigma.append(to_m * noise.carrier_rad[:, group.rows].reshape(n, group.rows.shape[1], -1))
         common.append(np.full((n, len(scenario.transmitter)), np.inf))
     return np.stack(sigma, axis=1), np.stack(common, axis=1)

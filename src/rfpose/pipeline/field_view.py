@@ -140,16 +140,15 @@ class History:
 
 
 def field_of_scenario(scenario: Scenario) -> FieldPicture:
-    """Return a site to which nothing has been measured; normals are those that the scenario gives."""
+    """Return a site to which nothing has been measured; normals are those of `Scenario.posture_enu`."""
     n = len(scenario.heliostat)
-    given = [h.normal_enu or (np.nan,) * 3 for h in scenario.heliostat]
-    normal = np.array(given, np.float64).reshape(1, n, 3)
+    normal = scenario.posture_enu.reshape(1, n, 3)
     shown = bool(np.isfinite(normal).any())
     return FieldPicture(
         **_site(scenario),
         time=("as in the scenario",) if shown else (),
         time_s=np.zeros(int(shown)),
-        normal_enu=unit(normal)[: int(shown)],
+        normal_enu=normal[: int(shown)],
         error_mrad=None,
         sigma_mrad=np.full((int(shown), n), np.nan),
         status=np.zeros((int(shown), n), np.int8),

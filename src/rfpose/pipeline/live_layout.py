@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
 
 from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, RfposeError, ScenarioError
-from rfpose.geometry import enu_from_azimuth_elevation
+from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.fields import radial_staggered, read_positions
-from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
+from rfpose.layout.fields import radial_staggered, read_positions, with_field
+from rfpose.layout.maps import ESTIMATORS, SCENARIO, Mirrors, summarise
 from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
 from rfpose.multilat import check_unambiguous
-from rfpose.scenario import Scenario, Transmitter
+from rfpose.scenario import Scenario, Transmitter, check_scenario
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -31,6 +30,7 @@ __all__ = [
     "SunPlace",
     "field_from_csv",
     "field_of",
+    "first_choice",
     "free_carrier_hz",
     "place_transmitters",
     "scenario_of_layout",
@@ -38,10 +38,16 @@ __all__ = [
     "sun_of",
 ]
 
-ESTIMATOR_NAMES: tuple[str, ...] = tuple(ESTIMATORS)
+ESTIMATOR_NAMES: tuple[str, ...] = (SCENARIO, *ESTIMATORS)
 OPTIMISED: tuple[str, ...] = tuple(CRITERIA)
 Postures = Literal["scenario", "sun", "level"]
 _CARRIER_TRIES = 400
+_POSTURE_WORDS = {
+    "own": "each heliostat's own",
+    "simulated sun": "reflecting the simulated sun",
+    "sun": "reflecting the sun as set",
+    "level": "level",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,18 +65,19 @@ class LayoutChoice:
     Attributes
     ----------
     estimator
-        One of `ESTIMATOR_NAMES`.
+        One of `ESTIMATOR_NAMES`; ``scenario``: as `rfpose process` solves it, reflections left out.
     tones
         Which of the scenario's tones count; empty: all.
     posture
-        ``scenario``: each heliostat's own normal, level without one. ``sun``: the sun onto the aim point. ``level``.
+        ``scenario``: as the scenario has them, see `rfpose.scenario.Scenario.posture_enu`. ``sun``: the sun onto the
+        aim point. ``level``.
     sun
         For posture ``sun``.
     per_tower, per_height_m, per_cable_m
         Cost of a tower, of a metre of height, of a metre of cable.
     """
 
-    estimator: str = "rigid"
+    estimator: str = SCENARIO
     tones: tuple[int, ...] = ()
     posture: Postures = "scenario"
     sun: SunPlace = SunPlace(azimuth_deg=180.0, elevation_deg=45.0)
@@ -112,6 +119,8 @@ class LiveMap:
     undetermined: int
     cost: float
     problem: str = ""
+    made_by: str = ""
+    """What the estimator uses, and the posture, in words."""
 
 
 def field_of(scenario: Scenario) -> FloatArray:
@@ -127,6 +136,15 @@ def field_from_csv(path: str | Path) -> FloatArray:
 def staggered_field(n_heliostat: int, *, first_radius_m: float, diagonal_m: float, height_m: float) -> FloatArray:
     """Return a radially staggered field (heliostat, xyz) about the origin [m]."""
     return radial_staggered(n_heliostat, first_radius_m=first_radius_m, diagonal_m=diagonal_m, height_m=height_m)
+
+
+def first_choice(scenario: Scenario) -> LayoutChoice:
+    """Return what a scenario is shown with at first: its own estimator, posture and simulated sun."""
+    if scenario.simulated_sun_enu is None:
+        return LayoutChoice()
+    azimuth, elevation = azimuth_elevation_from_enu(scenario.simulated_sun_enu)
+    place = SunPlace(azimuth_deg=float(np.degrees(azimuth)) % 360.0, elevation_deg=float(np.degrees(elevation)))
+    return LayoutChoice(sun=place)
 
 
 def sun_of(scenario: Scenario, moment: datetime) -> SunPlace:
@@ -176,10 +194,14 @@ class LiveLayout:
 
     def __init__(self, scenario: Scenario, choice: LayoutChoice, *, pivot_enu_m: FloatArray | None = None) -> None:
         self.choice = choice
-        self._estimator = ESTIMATORS[choice.estimator]
+        if pivot_enu_m is not None:
+            scenario = _with_field(scenario, pivot_enu_m)
+        self._heliostats = scenario.heliostat
+        self._posture = maps.posture_name(scenario) if choice.posture == "scenario" else choice.posture
+        self._speed_mps = scenario.radio.propagation_speed_mps
         self._bare = _bare(scenario, choice.tones)
-        self._n = len(scenario.heliostat) if pivot_enu_m is None else len(pivot_enu_m)
-        self._field = _mirrors(scenario, choice, pivot_enu_m) if self._n else None
+        self._n = len(scenario.heliostat)
+        self._field = _mirrors(scenario, choice) if self._n else None
 
     @property
     def pivot_enu_m(self) -> FloatArray:
@@ -200,8 +222,8 @@ class LiveLayout:
             site = _with_transmitters(self._bare, transmitters)
             maps.check_site(site.transmitter_enu_m)
             check_unambiguous(site.transmitter_enu_m, site.wavelength_m)
-            noise = maps.noise_of(site)
-            sigma = 1e3 * maps.normal_map(site.transmitter_enu_m, self._field, noise, self._estimator)
+            study = maps.study_of(site, self.choice.estimator, heliostats=self._heliostats)
+            sigma = 1e3 * study.bound(self._field)
         except RfposeError as error:
             return self._nothing(cost, str(error))
         summary = summarise(sigma)
@@ -214,7 +236,12 @@ class LiveLayout:
             worst=int(np.nanargmax(sigma)) if known.any() else None,
             undetermined=int(len(sigma) - known.sum()),
             cost=cost,
+            made_by=f"{self._made_by(study)}; posture: {_POSTURE_WORDS[self._posture]}",
         )
+
+    def _made_by(self, study: maps.Study) -> str:
+        said = list(dict.fromkeys(maps.in_words(e, self._speed_mps) for e in study.rows))
+        return said[0] if len(said) == 1 else f"heliostats differ ({' | '.join(said)})"
 
     def _nothing(self, cost: float, why: str) -> LiveMap:
         nan = float("nan")
@@ -242,42 +269,28 @@ def _bare(scenario: Scenario, tones: Sequence[int]) -> dict[str, Any]:
 
 
 def _with_transmitters(bare: dict[str, Any], transmitters: Sequence[Transmitter]) -> Scenario:
-    try:
-        return Scenario.model_validate({**bare, "transmitter": [t.model_dump() for t in transmitters]})
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        reason = first["msg"].removeprefix("Value error, ")
-        raise ScenarioError(f"`{place}`: {reason}" if place else reason) from error
+    return check_scenario({**bare, "transmitter": [t.model_dump() for t in transmitters]})
 
 
-def _mirrors(scenario: Scenario, choice: LayoutChoice, pivot_enu_m: FloatArray | None) -> Mirrors:
-    if choice.posture == "sun" and scenario.site.aim_enu_m is None:
+def _with_field(scenario: Scenario, pivot_enu_m: FloatArray) -> Scenario:
+    return with_field(scenario, [f"H{k + 1}" for k in range(len(pivot_enu_m))], pivot_enu_m)
+
+
+def _mirrors(scenario: Scenario, choice: LayoutChoice) -> Mirrors:
+    if choice.posture == "scenario":
+        return maps.mirrors_of(scenario)
+    if choice.posture == "level":
+        return maps.mirrors_of(scenario, normal_enu=[0.0, 0.0, 1.0])
+    if scenario.site.aim_enu_m is None:
         raise ScenarioError(
             f"scenario `{scenario.name}` has no aim point: add `aim_enu_m` to [site], or choose another posture"
         )
-    sun = None
-    if choice.posture == "sun":
-        if choice.sun.elevation_deg <= 0.0:
-            raise ScenarioError(
-                f"the sun is {-choice.sun.elevation_deg:.1f}° below the horizon; choose another time of day"
-            )
-        sun = enu_from_azimuth_elevation(np.radians(choice.sun.azimuth_deg), np.radians(choice.sun.elevation_deg))
-    level = np.array([0.0, 0.0, 1.0]) if choice.posture == "level" else None
-    if pivot_enu_m is None:
-        return maps.mirrors_of(scenario, normal_enu=level, sun_enu=sun)
-    if not scenario.heliostat:
-        raise ScenarioError(f"scenario `{scenario.name}` has no heliostat whose mirror the field could have; add one")
-    like = scenario.heliostat[0]
-    normal = level if level is not None else np.array(like.normal_enu or (0.0, 0.0, 1.0))
-    return maps.mirrors_facing(
-        pivot_enu_m,
-        np.array(like.receiver_mirror_m),
-        normal_enu=None if sun is not None else normal,
-        aim_enu_m=scenario.site.aim_enu_m,
-        sun_enu=sun,
-        arm_m=like.arm_m,
-    )
+    if choice.sun.elevation_deg <= 0.0:
+        raise ScenarioError(
+            f"the sun is {-choice.sun.elevation_deg:.1f}° below the horizon; choose another time of day"
+        )
+    sun = enu_from_azimuth_elevation(np.radians(choice.sun.azimuth_deg), np.radians(choice.sun.elevation_deg))
+    return maps.mirrors_of(scenario, sun_enu=sun)
 
 
 def free_carrier_hz(scenario: Scenario, transmitters: Sequence[Transmitter]) -> float:
@@ -316,26 +329,13 @@ def scenario_of_layout(
     ScenarioError
         The layout contradicts itself; the message points to the key.
     """
+    if pivot_enu_m is not None:
+        scenario = _with_field(scenario, pivot_enu_m)
     data = scenario.model_dump(exclude_none=True)
     kept = {t.id for t in transmitters}
     simulation = data.get("simulation", {})
     if simulation.get("blocked"):
         simulation["blocked"] = [b for b in simulation["blocked"] if b["transmitter"] in kept]
-    if pivot_enu_m is not None:
-        like = scenario.heliostat[0].model_dump(exclude_none=True)
-        like.pop("normal_enu", None)
-        n_receiver = len(scenario.heliostat[0].receiver_mirror_m)
-        data["heliostat"] = [
-            {
-                **like,
-                "id": f"H{k + 1}",
-                "pivot_enu_m": tuple(place),
-                "receiver_ids": [f"H{k + 1}_r{i}" for i in range(n_receiver)],
-            }
-            for k, place in enumerate(np.asarray(pivot_enu_m).tolist())
-        ]
-        simulation.pop("blocked", None)
-        simulation.pop("dropped", None)
     return _with_transmitters(data, transmitters)
 
 

@@ -21,7 +21,6 @@ from rfpose.scenario import Heliostat, Scenario
 __all__ = [
     "MirrorGroup",
     "calibration_sight",
-    "carrier_rf_hz",
     "group_hz",
     "is_calibrated",
     "mirror_groups",
@@ -44,6 +43,8 @@ class MirrorGroup:
         [m].
     kind
         The first of them.
+    uses_carrier
+        Whether carriers are compared between the receivers.
     """
 
     column: npt.NDArray[np.int64]
@@ -51,11 +52,7 @@ class MirrorGroup:
     places_m: FloatArray
     pivot_enu_m: FloatArray
     kind: Heliostat
-
-    @property
-    def uses_carrier(self) -> bool:
-        """Whether carriers can be compared between the receivers: only on one oscillator do their phases cancel."""
-        return self.kind.oscillator == "shared" and self.kind.carrier_phase
+    uses_carrier: bool
 
     @property
     def learns_delays(self) -> bool:
@@ -103,17 +100,13 @@ def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
             places_m=np.array([h.receiver_mirror_m for h in helio]) + arm[:, None],
             pivot_enu_m=scenario.pivot_enu_m[members],
             kind=helio[0],
+            uses_carrier=scenario.compares_carriers(helio[0]),
         )
 
 
 def is_calibrated(scenario: Scenario) -> bool:
     """Whether the transmitters' electronic phases are measured; if not, receivers of a mirror are compared."""
     return bool(scenario.calibration_receiver)
-
-
-def carrier_rf_hz(scenario: Scenario) -> FloatArray:
-    """(transmitter,) carrier frequencies at RF [Hz]."""
-    return np.asarray(scenario.radio.centre_frequency_hz + scenario.carrier_hz)
 
 
 def group_hz(scenario: Scenario, group: MirrorGroup) -> FloatArray:
@@ -160,7 +153,7 @@ def observations(
             )
         )
     if group.uses_carrier:
-        carrier_m = scenario.radio.propagation_speed_mps / carrier_rf_hz(scenario)
+        carrier_m = scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz
         to_m_each = carrier_m / (2.0 * np.pi)
         seen = np.isfinite(tones.phase_rad[..., 0])
         phase = np.where(seen, np.angle(tones.carrier), np.nan)

@@ -87,7 +87,7 @@ def _summary_of_integers(result: Result) -> dict[str, Any]:
     """Count, by wavelength, how integers of solved mirror-frames were found."""
     scenario = result.scenario
     names = [f"{f / 1e6:.9g} MHz" for f in np.sort(scenario.tone_hz)]
-    if any(h.oscillator == "shared" and h.carrier_phase for h in scenario.heliostat):
+    if any(scenario.compares_carriers(h) for h in scenario.heliostat):
         names.append("carrier")
     method = result.poses.integer_method[result.poses.status == PoseStatus.OK]
     return {

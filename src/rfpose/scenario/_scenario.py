@@ -10,6 +10,7 @@ import numpy as np
 import tomli_w
 from pydantic import Field, model_validator
 
+from rfpose import geometry
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import ScenarioError
 from rfpose.scenario._consistency import CHECKS
@@ -68,6 +69,16 @@ class Scenario(Record):
     def carrier_hz(self) -> FloatArray:
         """(transmitter,) carrier offsets from the centre frequency [Hz]."""
         return read_only(np.array([t.carrier_hz for t in self.transmitter], np.float64))
+
+    @cached_property
+    def carrier_rf_hz(self) -> FloatArray:
+        """(transmitter,) carrier frequencies at RF [Hz]; those of a recording about frequency zero may be negative."""
+        return read_only(self.radio.centre_frequency_hz + self.carrier_hz)
+
+    @cached_property
+    def has_rf_carriers(self) -> bool:
+        """Whether every carrier has a wavelength to measure or reflect with: a radio frequency above zero."""
+        return bool(np.all(self.carrier_rf_hz > 0.0))
 
     @cached_property
     def tone_hz(self) -> FloatArray:
@@ -134,6 +145,38 @@ class Scenario(Record):
         """Rows of the receiver axis that belong to one heliostat."""
         start = sum(len(h.receiver_ids) for h in self.heliostat[:i_heliostat])
         return slice(start, start + len(self.heliostat[i_heliostat].receiver_ids))
+
+    def compares_carriers(self, heliostat: Heliostat) -> bool:
+        """Whether the carriers' own phases are compared between a heliostat's receivers.
+
+        Only on one oscillator do the receivers' phases cancel, and only at radio frequencies above zero is there a
+        wavelength. Whoever needs to know whether the carrier takes part in a normal asks here.
+        """
+        return heliostat.oscillator == "shared" and heliostat.carrier_phase and self.has_rf_carriers
+
+    @cached_property
+    def simulated_sun_enu(self) -> FloatArray | None:
+        """(xyz,) towards the simulated sun of the first frame; None where the scenario lacks it, or an aim point."""
+        azimuth, elevation = self.simulation.sun_azimuth_deg, self.simulation.sun_elevation_deg
+        if azimuth is None or elevation is None or self.site.aim_enu_m is None:
+            return None
+        first = [np.radians(np.ravel(angle)[0]) for angle in (azimuth, elevation)]
+        return read_only(geometry.enu_from_azimuth_elevation(*first))
+
+    @cached_property
+    def posture_enu(self) -> FloatArray:
+        """(heliostat, xyz) unit normals that the scenario gives its mirrors; NaN where it gives none.
+
+        Each heliostat's own ``normal_enu``; else that which sends the simulated sun of the first frame to the aim
+        point, as `rfpose simulate` begins. Whatever shows or studies "the scenario's posture" takes it from here.
+        """
+        out = np.full((len(self.heliostat), 3), np.nan)
+        if self.simulated_sun_enu is not None and self.heliostat:
+            out = geometry.bisector_enu(np.array(self.site.aim_enu_m) - self.pivot_enu_m, self.simulated_sun_enu)
+        for i, heliostat in enumerate(self.heliostat):
+            if heliostat.normal_enu is not None:
+                out[i] = geometry.unit(heliostat.normal_enu)
+        return read_only(out)
 
     def scaled(self, factor: float) -> Scenario:
         """Return the scenario with every length, and every tone's wavelength, multiplied by ``factor``.

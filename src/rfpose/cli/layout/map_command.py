@@ -24,7 +24,8 @@ __all__ = ["command"]
     ),
 )
 @click.argument("scenario", type=click.Path(path_type=Path))
-@click.option("--estimator", "estimators", type=click.Choice(ESTIMATORS), multiple=True, help="Default: all.")
+@click.option("--estimator", "estimators", type=click.Choice(ESTIMATORS), multiple=True,
+              help="Default: all that the scenario allows; `scenario`: as `rfpose process` solves it.")  # fmt: skip
 @click.option("--snr", "tone_snr_db", type=float, help="Tone SNR [dB] instead of the scenario's.")
 @click.option("--line-of-sight", "plate", type=(float, float), metavar="WIDTH HEIGHT",
               help="Count only what receivers see past plates of this size [m].")  # fmt: skip
@@ -71,7 +72,7 @@ def command(
         )
     found = map_layout(
         scenario,
-        estimators=estimators or ESTIMATORS,
+        estimators=estimators or None,
         postures=postures(suns, day, year, stow),
         field_csv=field,
         tone_snr_db=tone_snr_db,
@@ -93,7 +94,9 @@ def _say(summary: dict[str, Any]) -> None:
     rows: list[list[str]] = [["PDOP", *_cells(summary["pdop"]), ""], ["VDOP", *_cells(summary["vdop"]), ""]]
     for name, values in summary["normal_mrad"].items():
         rows.append([f"normal, {name} [mrad]", *_cells(values), f"{100.0 * values['undetermined']:.3g} %"])
-    title = f"{summary['scenario']}: {summary['heliostats']} heliostats, {summary['postures']} posture(s)"
+    names = list(next(iter(summary["normal_by_posture_mrad"].values()), {}))
+    postures = f"posture: {names[0]}" if len(names) == 1 else f"{summary['postures']} postures"
+    title = f"{summary['scenario']}: {summary['heliostats']} heliostats, {postures}"
     table(title, ["bound", "rms", "median", "95 %", "worst", "unsolved"], rows)
     sight = summary.get("line_of_sight")
     if sight is not None:

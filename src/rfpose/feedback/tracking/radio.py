@@ -152,12 +152,10 @@ class RadioModel:
     # -- what goes into a pose -----------------------------------------------------------------------------
 
     def _uses_carrier(self) -> bool:
-        shared = self._kind.oscillator == "shared" and self._kind.carrier_phase
-        return shared and self._noise.carrier_sigma_m is not None
+        return self._scenario.compares_carriers(self._kind)
 
     def _carrier_wavelength_m(self) -> FloatArray:
-        radio = self._scenario.radio
-        return np.asarray(radio.propagation_speed_mps / (radio.centre_frequency_hz + self._scenario.carrier_hz))
+        return np.asarray(self._scenario.radio.propagation_speed_mps / self._scenario.carrier_rf_hz)
 
     def _sigma_shape(self) -> tuple[int, int, int]:
         n_group = len(self._scenario.tone) + int(self._uses_carrier())
@@ -224,7 +222,7 @@ class RadioModel:
                 scenario.transmitter_enu_m,
                 points,
                 reflectors=[mirror],
-                carrier_rf_hz=scenario.radio.centre_frequency_hz + scenario.carrier_hz,
+                carrier_rf_hz=scenario.carrier_rf_hz,
                 tone_hz=tone_hz,
                 free_space=self._spreads(),
                 propagation_speed_mps=scenario.radio.propagation_speed_mps,
@@ -236,8 +234,11 @@ class RadioModel:
         z = z.reshape(len(pivot), len(self._places), len(scenario.transmitter), -1)
         sigma = np.broadcast_to(self._sigma_m(rot), (len(self._pivot), *self._sigma_shape()))
         sigma = sigma[: len(pivot)]
-        waves = [np.full(len(scenario.transmitter), w) for w in scenario.wavelength_m] + [self._carrier_wavelength_m()]
-        order = [*np.argsort(-scenario.wavelength_m), *([len(scenario.tone)] if self._uses_carrier() else [])]
+        waves = [np.full(len(scenario.transmitter), w) for w in scenario.wavelength_m]
+        order = [int(q) for q in np.argsort(-scenario.wavelength_m)]
+        if self._uses_carrier():
+            order.append(len(waves))
+            waves.append(self._carrier_wavelength_m())
         return [
             Observation(
                 range_m=np.ascontiguousarray(z[..., q]),
@@ -259,7 +260,7 @@ class RadioModel:
             self._scenario.transmitter_enu_m,
             self._places,
             self._observations(pivot, rot),
-            carrier_rf_hz=self._scenario.radio.centre_frequency_hz + self._scenario.carrier_hz,
+            carrier_rf_hz=self._scenario.carrier_rf_hz,
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,
             reflectors=(Reflector(point_enu_m=(0.0, 0.0, ground.height_m)),) if estimate else (),

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout.gain import Gain, Reflection, normal_gain
-from rfpose.layout.maps import Estimator, Mirrors, check_site, noise_of
+from rfpose.layout.maps import Estimator, Mirrors, check_site, estimators_of, noise_of
 from rfpose.multilat import check_unambiguous
 from rfpose.multilat.ground import Reflector, range_shift_m
 from rfpose.multilat.rigid import Knowledge
 from rfpose.multilat.rigid.integers import Observation, solve_ladder
-from rfpose.scenario import Heliostat, Scenario
+from rfpose.scenario import Scenario
 
 __all__ = ["Plan", "make_plan"]
 
@@ -102,11 +102,6 @@ class Plan:
         return out
 
     @property
-    def carrier_rf_hz(self) -> FloatArray:
-        """(transmitter,) carriers at RF [Hz]."""
-        return np.asarray(self.scenario.radio.centre_frequency_hz + self.scenario.carrier_hz)
-
-    @property
     def reflects(self) -> bool:
         """Whether the ground reflects and the solver knows it."""
         return self.scenario.simulation.ground is not None and self.scenario.budget.ground != "ignored"
@@ -131,7 +126,7 @@ class Plan:
             transmitter_enu_m,
             point_enu_m.reshape(-1, 3),
             reflectors=(reflector,),
-            carrier_rf_hz=self.carrier_rf_hz,
+            carrier_rf_hz=self.scenario.carrier_rf_hz,
             tone_hz=tone,
             free_space=self.scenario.simulation.path_loss == "free_space",
             propagation_speed_mps=self.scenario.radio.propagation_speed_mps,
@@ -232,9 +227,8 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
     own, tone_hz = noise.tone_sigma_m[order], scenario.tone_hz[order]
     wavelength = np.repeat(scenario.wavelength_m[order][:, None], len(transmitter), axis=1)
     if estimator.carrier and noise.carrier_sigma_m is not None:
-        rf_hz = scenario.radio.centre_frequency_hz + scenario.carrier_hz
         own = np.vstack([own, noise.carrier_sigma_m])
-        wavelength = np.vstack([wavelength, scenario.radio.propagation_speed_mps / rf_hz])
+        wavelength = np.vstack([wavelength, scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz])
         tone_hz = np.append(tone_hz, 0.0)
     receiver = mirrors.receiver_enu_m
     thermal = np.broadcast_to(own[:, None], (len(receiver), len(own), receiver.shape[1], len(transmitter)))
@@ -271,31 +265,13 @@ def _estimator(scenario: Scenario, pose: str) -> Estimator:
         raise GeometryError("the scenario has no heliostats; add some, or a field from CSV")
     if pose == "independent":
         return Estimator(name=pose, rigid=False)
-    kinds = {_kind(h) for h in scenario.heliostat}
+    kinds = estimators_of(scenario)
     if len(kinds) > 1:
         raise GeometryError(
             "heliostats differ in oscillator, delays, pivot survey, mount or carrier phase; study them in separate "
             "scenarios"
         )
-    one = scenario.heliostat[0]
-    shared = one.oscillator == "shared"
-    clock = np.inf
-    if shared and one.receiver_delay_sigma_s is not None:
-        clock = one.receiver_delay_sigma_s * scenario.radio.propagation_speed_mps
-    return Estimator(
-        name=pose,
-        clock_sigma_m=clock,
-        carrier=shared
-        and one.carrier_phase
-        and bool(np.all(scenario.radio.centre_frequency_hz + scenario.carrier_hz > 0)),
-        pivot_sigma_m=np.inf if one.pivot_sigma_m is None else one.pivot_sigma_m,
-        two_axis=one.mount == "azimuth_elevation",
-    )
-
-
-def _kind(heliostat: Heliostat) -> tuple[object, ...]:
-    h = heliostat
-    return h.oscillator, h.receiver_delay_sigma_s, h.pivot_sigma_m, h.mount, h.carrier_phase
+    return next(iter(kinds))
 
 
 def _classes(scenario: Scenario, tone_hz: FloatArray) -> npt.NDArray[np.int64]:

@@ -371,7 +371,7 @@ class Multipath:
         both = 0.5 * (mean_cos(kappa[:, None] - kappa) - mean_cos(kappa[:, None] + kappa))
         cov = 0.5 * a**2 * both / (kappa[:, None] * kappa)
         values, vectors = np.linalg.eigh(cov)
-        carrier_k = 2.0 * np.pi * plan.carrier_rf_hz / speed
+        carrier_k = 2.0 * np.pi * plan.scenario.carrier_rf_hz / speed
         return vectors * np.sqrt(np.maximum(values, 0.0)), a / np.sqrt(2.0) / carrier_k
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
@@ -402,7 +402,7 @@ def _stray_m(world: World, a: float, excess_m: float, shape: tuple[int, ...], to
     phase = 2.0 * np.pi * world.rng.random(shape)
     detour = world.rng.exponential(excess_m, shape)
     speed = world.plan.scenario.radio.propagation_speed_mps
-    k = 2.0 * np.pi * world.plan.carrier_rf_hz / speed
+    k = 2.0 * np.pi * world.plan.scenario.carrier_rf_hz / speed
     carrier = 1.0 + a * np.exp(-1j * phase)
     out = []
     for hz in tone_hz:

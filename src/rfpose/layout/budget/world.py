@@ -214,7 +214,7 @@ class World:
             plan.scenario.transmitter_enu_m,
             self._assumed_places(n_draw),
             observations,
-            carrier_rf_hz=plan.carrier_rf_hz,
+            carrier_rf_hz=plan.scenario.carrier_rf_hz,
             start_pivot_enu_m=np.tile(plan.mirrors.pivot_enu_m, (n_draw, 1)),
             start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
             reflectors=(plan.reflector(coefficient),),

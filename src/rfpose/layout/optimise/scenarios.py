@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.layout.maps import check_site
-from rfpose.scenario import Scenario, Transmitter
+from rfpose.scenario import Scenario, Transmitter, check_scenario
 
 __all__ = ["scenario_with"]
 
@@ -19,7 +19,7 @@ def scenario_with(scenario: Scenario, transmitter_enu_m: npt.ArrayLike, *, n_exi
 
     Raises
     ------
-    ScenarioError, pydantic.ValidationError
+    ScenarioError
         The band cannot hold so many carriers.
     """
     place = check_site(transmitter_enu_m)
@@ -46,4 +46,4 @@ def scenario_with(scenario: Scenario, transmitter_enu_m: npt.ArrayLike, *, n_exi
     blocked = data.get("simulation", {}).get("blocked", ())
     if blocked:
         data["simulation"]["blocked"] = [b for b in blocked if b["transmitter"] in kept]
-    return Scenario.model_validate(data)
+    return check_scenario(data)

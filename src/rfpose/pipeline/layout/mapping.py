@@ -16,18 +16,21 @@ from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.budget import make_plan, noise_bound
-from rfpose.layout.maps import ESTIMATORS, Estimator, Mirrors, Noise, summarise
+from rfpose.layout.maps import ESTIMATORS, SCENARIO, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
 from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.layout.site import Posture, Postures, Sight, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures import _mark, _new_figure, _save
-from rfpose.scenario import Scenario
+from rfpose.scenario import Scenario, check_scenario
 
 __all__ = ["LayoutMap", "SightMap", "draw_layout_map", "map_layout", "write_layout_csv"]
 
 REFLECTION = "reflection"
 """The scenario's own solver, the ground's coefficient estimated with the poses; where ``[simulation.ground]`` is."""
+
+NAMES = (SCENARIO, *ESTIMATORS, REFLECTION)
+"""Estimators to study; the first is that of `rfpose process`."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -150,7 +153,7 @@ def _sensitivity_dict(ids: tuple[str, ...], found: TransmitterSensitivity) -> di
 def map_layout(
     scenario_path: str | Path,
     *,
-    estimators: Sequence[str] = (*ESTIMATORS, REFLECTION),
+    estimators: Sequence[str] | None = None,
     suns_deg: Sequence[Sun] = (),
     postures: Postures | None = None,
     field_csv: str | Path | None = None,
@@ -165,8 +168,9 @@ def map_layout(
     scenario_path
         TOML.
     estimators
-        Names out of `rfpose.layout.maps.ESTIMATORS`, and ``reflection``: the scenario's own solver with the
-        ground's coefficient estimated, where the scenario has a ground and line of sight is not asked for.
+        Out of `NAMES`: ``scenario``, what `rfpose process` makes of it, without reflections; those of
+        `rfpose.layout.maps.ESTIMATORS`; and ``reflection``: the scenario's own solver with the ground's coefficient
+        estimated. None: all that the scenario allows.
     suns_deg
         Azimuth and elevation of suns; short for ``postures``.
     postures
@@ -185,45 +189,43 @@ def map_layout(
     ------
     ScenarioError
         The scenario or CSV is bad; transmitters too few, on a line or plane; heliostats on each other or on a
-        transmitter; the field wider than the longest tone resolves; the message begins with the file.
+        transmitter; the field wider than the longest tone resolves; an estimator that the scenario does not allow. The
+        message begins with the file.
     """
     scenario = load_site(scenario_path, field_csv)
     transmitter = scenario.transmitter_enu_m
+    if estimators is None:
+        estimators = [name for name in NAMES if not _lacks(scenario, name, sight)]
+    for name in estimators:
+        lacking = _lacks(scenario, name, sight)
+        if lacking:
+            raise ScenarioError(f"{scenario_path}: estimator `{name}` {lacking}")
     studied = postures_of(scenario, postures or Postures(suns_deg=suns_deg), scenario_path)
-    noise = maps.noise_of(scenario, tone_snr_db=tone_snr_db)
-    if noise.carrier_sigma_m is None:
-        estimators = [name for name in estimators if not ESTIMATORS[name].carrier]
     seen = (
         None if sight is None else [visible(transmitter, p.mirrors, sight.plates, tower=sight.tower) for p in studied]
     )
     dilution = maps.dilution(transmitter, scenario.pivot_enu_m)
     rms, worst, by_posture, undetermined, lost, response = {}, {}, {}, {}, {}, {}
-    if scenario.simulation.ground is not None and sight is None and REFLECTION in estimators:
-        sigma = 1e3 * np.array([_with_reflection(scenario, p, scenario_path) for p in studied])
-        rms[REFLECTION], by_posture[REFLECTION] = _rms(sigma, 0), _rms(sigma, 1)
-        worst[REFLECTION], undetermined[REFLECTION] = sigma.max(axis=0), float(np.isnan(sigma).mean())
     for name in estimators:
         if name == REFLECTION:
-            continue
-        estimator = ESTIMATORS[name]
-        sigma = 1e3 * np.array(
-            [
-                maps.normal_map(transmitter, p.mirrors, noise, estimator, visible=None if seen is None else seen[k])
-                for k, p in enumerate(studied)
-            ]
-        )
+            sigma = 1e3 * np.array([_with_reflection(scenario, p, tone_snr_db, scenario_path) for p in studied])
+        else:
+            study = maps.study_of(scenario, name, tone_snr_db=tone_snr_db)
+            sigma = 1e3 * np.array(
+                [study.bound(p.mirrors, visible=None if seen is None else seen[k]) for k, p in enumerate(studied)]
+            )
+            lost[name] = _without_each(study, studied, seen)
+            if sensitivity and len(study.rows) == 1:
+                response[name] = transmitter_sensitivity(
+                    transmitter,
+                    stacked([studied[k].mirrors for k in _some(len(studied))]),
+                    study.noise,
+                    next(iter(study.rows)),
+                    calibration_enu_m=scenario.calibration_enu_m,
+                )
         rms[name], by_posture[name] = _rms(sigma, 0), _rms(sigma, 1)
         worst[name] = np.where(np.isfinite(sigma).any(axis=0), np.fmax.reduce(sigma, axis=0), np.nan)
         undetermined[name] = float(np.isnan(sigma).mean())
-        lost[name] = _without_each(transmitter, studied, noise, estimator, seen)
-        if sensitivity:
-            response[name] = transmitter_sensitivity(
-                transmitter,
-                stacked([studied[k].mirrors for k in _some(len(studied))]),
-                noise,
-                estimator,
-                calibration_enu_m=scenario.calibration_enu_m,
-            )
     return LayoutMap(
         scenario=scenario,
         heliostat_ids=scenario.heliostat_ids,
@@ -241,12 +243,28 @@ def map_layout(
     )
 
 
-def _with_reflection(scenario: Scenario, posture: Posture, path: str | Path) -> FloatArray:
+def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
+    """Return why an estimator cannot be studied, as the end of a sentence; empty where it can."""
+    carrier = name == REFLECTION or (name in ESTIMATORS and ESTIMATORS[name].carrier)
+    if name == REFLECTION and scenario.simulation.ground is None:
+        return "needs a ground that reflects; add [simulation.ground], or choose another"
+    if name == REFLECTION and sight is not None:
+        return "knows no line of sight; leave --line-of-sight away, or choose another"
+    if carrier and not scenario.has_rf_carriers:
+        return (
+            "needs carriers whose radio frequencies are above zero; set `radio.centre_frequency_hz`, or choose another"
+        )
+    return ""
+
+
+def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | None, path: str | Path) -> FloatArray:
     """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
     data = scenario.model_dump(exclude_none=True)
     data["budget"] = {**data.get("budget", {}), "ground": "estimated"}
+    if tone_snr_db is not None:
+        data["simulation"] = {**data.get("simulation", {}), "tone_snr_db": tone_snr_db}
     try:
-        return noise_bound(make_plan(Scenario.model_validate(data), posture.mirrors))
+        return noise_bound(make_plan(check_scenario(data), posture.mirrors))
     except (GeometryError, InvalidInputError) as error:
         raise ScenarioError(f"{path}: {error}") from error
 
@@ -276,14 +294,15 @@ def _some(n_posture: int) -> list[int]:
     return [int(k) for k in np.linspace(0, n_posture - 1, _MOST_LOST_POSTURES).round()]
 
 
-def _without_each(
-    transmitter: FloatArray, postures: list[Posture], noise: Noise, estimator: Estimator, seen: list[BoolArray] | None
-) -> FloatArray:
+def _without_each(study: Study, postures: list[Posture], seen: list[BoolArray] | None) -> FloatArray:
     """Rms over field and postures with each transmitter lost (transmitter,) [mrad]; with sight, of what is left."""
-    used = _some(len(postures))
-    field_of_all: Mirrors = stacked([postures[k].mirrors for k in used])
-    visible_of_all = None if seen is None else np.concatenate([seen[k] for k in used])
-    sigma = maps.normal_without_each(transmitter, field_of_all, noise, estimator, visible=visible_of_all)
+    sigma = np.concatenate(
+        [
+            study.without_each(postures[k].mirrors, visible=None if seen is None else seen[k])
+            for k in _some(len(postures))
+        ],
+        axis=1,
+    )
     rms = 1e3 * (np.sqrt(np.mean(sigma**2, axis=1)) if seen is None else _rms(sigma, 1))
     return np.where(np.isnan(rms), np.inf, rms)
 

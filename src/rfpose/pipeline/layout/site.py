@@ -15,11 +15,11 @@ from rfpose.feedback.sun import Site as SunSite
 from rfpose.feedback.sun import sun_position
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.fields import read_positions
+from rfpose.layout.fields import read_positions, with_field
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.sight import Plates, Tower
 from rfpose.multilat import check_unambiguous
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import Scenario, check_scenario, load_scenario
 
 __all__ = ["Posture", "Postures", "Sight", "Sun", "load_site", "postures_of", "stacked"]
 
@@ -86,35 +86,21 @@ def load_site(path: str | Path, field_csv: str | Path | None, *, settings: dict[
     """
     scenario = load_scenario(path)
     if field_csv is not None:
-        scenario = _with_field(scenario, path, field_csv)
+        try:
+            scenario = with_field(scenario, *read_positions(field_csv))
+        except ScenarioError as error:
+            at = f"{path}, field of {field_csv}: "
+            raise ScenarioError(str(error) if str(error).startswith(str(field_csv)) else f"{at}{error}") from error
     if settings:
         data = scenario.model_dump(exclude_none=True)
         data["budget"] = {**data.get("budget", {}), **settings}
-        scenario = Scenario.model_validate(data)
+        scenario = check_scenario(data)
     try:
         check_unambiguous(maps.check_site(scenario.transmitter_enu_m), scenario.wavelength_m)
         maps.check_clear(scenario)
     except GeometryError as error:
         raise ScenarioError(f"{path}: {error}") from error
     return scenario
-
-
-def _with_field(scenario: Scenario, path: str | Path, field_csv: str | Path) -> Scenario:
-    if not scenario.heliostat:
-        raise ScenarioError(f"{path}: no heliostat whose mirror the field in {field_csv} could have; add one")
-    ids, pivot = read_positions(field_csv)
-    like = scenario.heliostat[0].model_dump(exclude_none=True)
-    like.pop("normal_enu", None)
-    n_receiver = len(scenario.heliostat[0].receiver_mirror_m)
-    data = scenario.model_dump(exclude_none=True)
-    data["heliostat"] = [
-        {**like, "id": name, "pivot_enu_m": tuple(place), "receiver_ids": [f"{name}_r{k}" for k in range(n_receiver)]}
-        for name, place in zip(ids, pivot.tolist(), strict=True)
-    ]
-    simulation = data.get("simulation", {})
-    simulation.pop("blocked", None)
-    simulation.pop("dropped", None)
-    return Scenario.model_validate(data)
 
 
 def postures_of(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Posture]:
@@ -144,11 +130,7 @@ def _suns(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Postur
     if (wanted.day is not None or wanted.year is not None) and not suns:
         raise ScenarioError(f"{path}: the sun stays below {_LOWEST_SUN_DEG:g}° on that day; choose another")
     if not suns and not wanted.stow:
-        azimuth, elevation = scenario.simulation.sun_azimuth_deg, scenario.simulation.sun_elevation_deg
-        own = all(h.normal_enu is not None for h in scenario.heliostat)
-        if own or azimuth is None or elevation is None or scenario.site.aim_enu_m is None:
-            return [Posture(name="own", mirrors=maps.mirrors_of(scenario))]
-        suns = [("simulated sun", (float(np.ravel(azimuth)[0]), float(np.ravel(elevation)[0])))]
+        return [Posture(name=maps.posture_name(scenario), mirrors=maps.mirrors_of(scenario))]
     return [Posture(name=name, mirrors=maps.mirrors_of(scenario, sun_enu=_direction(sun))) for name, sun in suns]
 
 

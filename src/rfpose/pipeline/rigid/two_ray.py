@@ -20,7 +20,6 @@ from rfpose.pipeline.choice import reflectors_of
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
     calibration_sight,
-    carrier_rf_hz,
 )
 from rfpose.pipeline.rigid.found import (
     Found,
@@ -226,7 +225,7 @@ def _solve_ground(
         scenario.transmitter_enu_m,
         mirrors.places,
         mirrors.phases,
-        carrier_rf_hz=carrier_rf_hz(scenario),
+        carrier_rf_hz=scenario.carrier_rf_hz,
         start_pivot_enu_m=mirrors.pivot,
         start_rot_enu_from_mirror=mirrors.rot,
         reflectors=reflectors,

@@ -9,7 +9,7 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.pipeline.live_layout import LayoutChoice, free_carrier_hz, scenario_of_layout
+from rfpose.pipeline.live_layout import first_choice, free_carrier_hz, scenario_of_layout
 from rfpose.scenario import Scenario, Transmitter
 from rfpose.viewer.state.observed import Event
 
@@ -39,7 +39,7 @@ class LayoutEdit:
         self.moved = Event()
         self.chosen = Event()
         self.scenario = scenario
-        self.choice = LayoutChoice()
+        self.choice = first_choice(scenario)
         self.pivot_enu_m: FloatArray | None = None
         self._now = _Snapshot(scenario.transmitter, frozenset())
         self._undo: list[_Snapshot] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from datetime import UTC, datetime
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -407,7 +408,9 @@ class LayoutView(View):
         if edit is None:
             return
         if found.problem:
-            self.figures.setText(f'<span style="color:{self.theme.warning}"><b>No map:</b> {found.problem}</span>')
+            self.figures.setText(
+                f'<span style="color:{self.theme.warning}"><b>No map:</b> {escape(found.problem)}</span>'
+            )
             return
         worst = "–"
         if found.worst is not None:
@@ -416,6 +419,7 @@ class LayoutView(View):
         lost = f"<br><b>{found.undetermined}</b> mirrors undetermined" if found.undetermined else ""
         self.figures.setText(
             f"<b>{len(found.sigma_mrad)}</b> mirrors, bound of the normal (RMS angle)<br>"
+            f"{escape(found.made_by)}<br>"
             f"rms <b>{found.rms_mrad:.4g}</b> mrad, median {found.median_mrad:.4g} mrad<br>"
             f"worst <b>{found.worst_mrad:.4g}</b> mrad at <b>{worst}</b> (ringed)<br>"
             f"cost <b>{found.cost:.6g}</b>, {len(edit.transmitters)} transmitters{lost}"
