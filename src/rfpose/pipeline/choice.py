@@ -20,6 +20,10 @@ REFLECTIONS = ("estimate", "ignore")
 """What may be asked for instead of what the scenario says of reflections."""
 
 
+_MODELS = ("none", "estimate", "known", "fresnel")
+_SWITCH = ("on", "off")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseChoice:
     """An estimator of poses.
@@ -43,7 +47,16 @@ class PoseChoice:
 
     @classmethod
     def of(cls, settings: Mapping[str, str], scenario: Scenario) -> PoseChoice:
-        """Return what a result's settings say; what they do not say is as the scenario has it."""
+        """Return what a result's settings say; what they do not say is as the scenario has it.
+
+        Raises
+        ------
+        InvalidInputError
+            They say what no estimator of poses is.
+        """
+        for name, allowed in (("reflection", _MODELS), ("integrity", _SWITCH), ("filter", _SWITCH)):
+            if settings.get(name, allowed[0]) not in allowed:
+                raise InvalidInputError(f"`{name}` must be one of {', '.join(allowed)}, got {settings[name]!r:.60}")
         default = choose(scenario, pose=settings["pose"])
         if default.pose != "rigid":
             return default

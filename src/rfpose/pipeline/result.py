@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -12,11 +13,13 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import Calibration, TonePhases
+from rfpose.errors import InvalidInputError
 from rfpose.multilat import RangeDifferences
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
 __all__ = [
+    "LAST_TIME_S",
     "DelayTable",
     "FilteredTable",
     "FixTable",
@@ -26,6 +29,7 @@ __all__ = [
     "Result",
     "StatusArray",
     "frame_time",
+    "rate_of",
 ]
 
 StatusArray = npt.NDArray[np.int8]
@@ -243,7 +247,28 @@ class Result:
     @property
     def sample_rate(self) -> Fraction:
         """Nominal sample rate [1/s]."""
-        return Fraction(self.settings["sample_rate"])
+        return rate_of(self.settings)
+
+
+LAST_TIME_S = 253_402_300_799
+"""The last second of the year 9999, after which there are no dates."""
+
+_RATE = re.compile(r"[0-9]{1,40}(/[0-9]{1,40})?")
+
+
+def rate_of(settings: Mapping[str, str]) -> Fraction:
+    """Return the sample rate that settings name, as a number or a ratio of two [1/s].
+
+    Raises
+    ------
+    InvalidInputError
+        It is none, or not greater than zero.
+    """
+    text = settings.get("sample_rate", "")
+    numerator, _, denominator = text.partition("/")
+    if not _RATE.fullmatch(text) or not int(numerator) or not int(denominator or 1):
+        raise InvalidInputError(f"`sample_rate` must be a number greater than zero or a ratio of two, got {text!r:.60}")
+    return Fraction(text)
 
 
 def frame_time(start_index: int, sample_rate: Fraction) -> datetime:

@@ -9,6 +9,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,15 @@ import numpy.typing as npt
 
 from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
-from rfpose.errors import RecordingError, ScenarioError
+from rfpose.errors import RecordingError, RfposeError, ScenarioError
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
+from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
 from rfpose.pipeline.result import (
+    LAST_TIME_S,
     DelayTable,
     FilteredTable,
     FixTable,
@@ -31,8 +35,9 @@ from rfpose.pipeline.result import (
     PoseTable,
     ReflectionTable,
     Result,
+    rate_of,
 )
-from rfpose.scenario import Scenario, parse_scenario
+from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
 __all__ = [
@@ -163,6 +168,9 @@ _STATUS: Mapping[str, type[IntEnum]] = {
 }
 
 
+_TRANSMITTER_INDEX = ("ranges/reference", "integrity/worst_transmitter")
+
+
 def _group_keys(group: str) -> list[str]:
     return [path.partition("/")[2] for path in KEYS if path.startswith(f"{group}/")]
 
@@ -223,11 +231,7 @@ def _write(file: h5py.File, path: str, values: npt.ArrayLike) -> None:
 
 def is_result(path: str | Path) -> bool:
     """Tell whether a file says that it is an rfpose-result; false for whatever cannot be opened."""
-    try:
-        with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("format") == FORMAT)
-    except OSError:
-        return False
+    return format_of(path) == FORMAT
 
 
 def read_result(path: str | Path) -> Result:
@@ -236,8 +240,8 @@ def read_result(path: str | Path) -> Result:
     Raises
     ------
     RecordingError
-        Missing, truncated, not HDF5, another format or version, or a dataset that is missing or has the wrong
-        type or shape; the message names the file and the place.
+        Missing, truncated, not HDF5, another format or version, or something in it is missing, of another type or
+        shape, or says what no result says; the message names the file and the place.
     """
     path = Path(path)
     if not path.exists():
@@ -247,7 +251,7 @@ def read_result(path: str | Path) -> Result:
             return _Reader(path, file).result()
     except RecordingError:
         raise
-    except (OSError, RuntimeError, KeyError) as error:
+    except DAMAGES as error:
         raise RecordingError(
             f"{path}: cannot be read as HDF5 ({error}); it is truncated or another kind of file: process again"
         ) from error
@@ -275,11 +279,12 @@ class _Reader:
             "tone": len(scenario.tone_hz),
             "heliostat": len(scenario.heliostat_ids),
         }
-        start_index = self._array("frames/start_index")
+        settings = self._settings(scenario)
+        start_index = self._start_index(Fraction(settings["sample_rate"]))
         tones = self._group("tones")
         return Result(
             scenario=scenario,
-            settings=self._settings(),
+            settings=settings,
             frame_start_index=start_index,
             tones=TonePhases(
                 **tones,
@@ -300,20 +305,41 @@ class _Reader:
         return RecordingError(f"{self._path}: {what}; {remedy}")
 
     def _scenario(self) -> Scenario:
-        dataset = self._file.get("scenario")
-        if not isinstance(dataset, h5py.Dataset) or dataset.shape != ():
-            raise self._error("`/scenario` is missing or no text", "process again")
         try:
-            return parse_scenario(dataset.asstr()[()], source=f"{self._path}:/scenario")
-        except (ScenarioError, TypeError) as error:
-            raise RecordingError(str(error)) from error
+            return parse_scenario(text_of(self._file.get("scenario")), source=f"{self._path}:/scenario")
+        except ScenarioError as error:
+            raise RecordingError(f"{error}; the result is damaged: process again") from error
+        except ValueError as error:
+            raise self._error(f"`/scenario` {error}", "process again") from error
 
-    def _settings(self) -> dict[str, str]:
+    def _settings(self, scenario: Scenario) -> dict[str, str]:
         group = self._file.get("settings")
-        settings = {} if group is None else {name: str(value) for name, value in group.attrs.items()}
-        if "sample_rate" not in settings:
-            raise self._error("`/settings` is missing or lacks `sample_rate`", "process again")
-        return settings
+        found = dict(group.attrs.items()) if isinstance(group, h5py.Group) else {}
+        for name, value in found.items():
+            if not isinstance(value, str):
+                raise self._error(f"attribute `{name}` of `/settings` is no text", "process again")
+        for name in ("sample_rate", "estimator", "pose"):
+            if name not in found:
+                raise self._error(f"`/settings` is missing or lacks `{name}`", "process again")
+        try:
+            rate_of(found)
+            PoseChoice.of(found, scenario)
+        except RfposeError as error:
+            raise self._error(f"`/settings`: {error}", "process again") from error
+        return found
+
+    def _start_index(self, sample_rate: Fraction) -> npt.NDArray[np.int64]:
+        starts = self._array("frames/start_index")
+        late = np.flatnonzero((starts < 0) | (starts > min(LAST_TIME_S * sample_rate, MAX_SAMPLE_INDEX)))
+        if late.size:
+            value = starts[late[0]]
+            raise self._error(
+                f"`/frames/start_index` [{late[0]}] is {value}, no time until the year 9999", "process again"
+            )
+        back = np.flatnonzero(np.diff(starts) <= 0)
+        if back.size:
+            raise self._error(f"`/frames/start_index` [{back[0] + 1}] is not after the one before", "process again")
+        return starts
 
     def _group(self, group: str) -> dict[str, npt.NDArray[Any]]:
         return {name: self._array(f"{group}/{name}") for name in _group_keys(group)}
@@ -349,4 +375,21 @@ class _Reader:
         for axis, got in zip(key.axes, dataset.shape, strict=True):
             if isinstance(axis, str):
                 self._length.setdefault(axis, got)
-        return read_only(np.asarray(dataset[()], dtype=key.dtype))
+        try:
+            values = array_of(dataset, key.dtype)
+        except DAMAGES as error:
+            raise self._error(f"`/{path}` {error}", "process again") from error
+        self._check_codes(path, values)
+        return read_only(values)
+
+    def _check_codes(self, path: str, values: npt.NDArray[Any]) -> None:
+        """Refuse codes that mean nothing, and transmitters that do not exist."""
+        if path in _STATUS:
+            good = np.isin(values, [int(code) for code in _STATUS[path]])
+        elif path in _TRANSMITTER_INDEX:
+            good = (values >= -1) & (values < self._length["transmitter"])
+        else:
+            return
+        if not good.all():
+            at = tuple(int(i) for i in np.argwhere(~good)[0])
+            raise self._error(f"`/{path}` {list(at)} is {values[at]}, which means nothing", "process again")

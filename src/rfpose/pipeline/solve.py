@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +24,7 @@ from rfpose.multilat import (
 from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
 from rfpose.pipeline.mirrors import is_calibrated
-from rfpose.pipeline.result import FixTable, PoseTable, Result
+from rfpose.pipeline.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
@@ -152,7 +151,7 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
             independent,
             scenario,
             choice,
-            sample_rate=Fraction(settings["sample_rate"]),
+            sample_rate=rate_of(settings),
         )
     return Result(
         scenario=scenario,

@@ -17,7 +17,7 @@ from rfpose.foreign import exact_rate
 from rfpose.recording import keys
 from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
 from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
-from rfpose.scenario import Scenario, parse_scenario
+from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
 __all__ = ["NativeRecording"]
@@ -271,7 +271,7 @@ class _Fields:
         rows: IndexArray = dataset[()]
         start, count, offset = rows[:, 0], rows[:, 1], rows[:, 2]
         # subtractions, not sums: numbers from a damaged file must not overflow into plausible ones
-        in_range = (start >= 0) & (start < 2**62) & (count > 0) & (offset >= 0) & (offset <= n_stored)
+        in_range = (start >= 0) & (start <= MAX_SAMPLE_INDEX) & (count > 0) & (offset >= 0) & (offset <= n_stored)
         in_range &= count <= n_stored - np.clip(offset, 0, n_stored)
         if not in_range.all():
             i = int(np.flatnonzero(~in_range)[0])

@@ -26,7 +26,7 @@ from rfpose.recording.base import (
     as_stored,
 )
 from rfpose.recording.output import Hdf5Output, refuse_existing
-from rfpose.scenario import Scenario
+from rfpose.scenario import ID_PATTERN, MAX_ID_LENGTH, MAX_SAMPLE_INDEX, Scenario
 from rfpose.truth import Truth
 
 __all__ = ["RecordingWriter"]
@@ -35,7 +35,7 @@ _CHUNK_BYTES = 2**20
 _SMALLEST_CHUNK_SAMPLES = 2**14
 _CACHE_BYTES = 2**26
 """Chunks that are being filled, over all receivers together."""
-_RECEIVER_ID = re.compile(r"[A-Za-z0-9_.\-]+")
+_RECEIVER_ID = re.compile(ID_PATTERN)
 
 
 class RecordingWriter:
@@ -96,9 +96,10 @@ class RecordingWriter:
         if not receiver_ids or len(set(receiver_ids)) != len(receiver_ids):
             raise InvalidInputError("`receiver_ids` must name at least one receiver, and none twice")
         for receiver_id in receiver_ids:
-            if not _RECEIVER_ID.fullmatch(receiver_id) or receiver_id in (".", ".."):
+            if not _RECEIVER_ID.fullmatch(receiver_id) or len(receiver_id) > MAX_ID_LENGTH:
                 raise InvalidInputError(
-                    f"`receiver_ids` may hold letters, digits, `_`, `-` and `.`, got {receiver_id!r}"
+                    f"`receiver_ids` may hold letters, digits, `_`, `-` and `.`, {MAX_ID_LENGTH} at most, got "
+                    f"{receiver_id!r:.200}"
                 )
         self.path = Path(path)
         refuse_existing(self.path, overwrite=overwrite)
@@ -170,6 +171,8 @@ class RecordingWriter:
             raise InvalidInputError(
                 f"`start_index` must not go back: `{receiver_id}` is written up to {reached}, got {start_index}"
             )
+        if start_index + len(samples) > MAX_SAMPLE_INDEX:
+            raise InvalidInputError(f"`start_index` must stay below {MAX_SAMPLE_INDEX}, got {start_index}")
         if len(samples) == 0:
             return
         output = self._opened()

@@ -11,7 +11,10 @@ from rfpose.scenario._scenario import Receiver, Scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
 from rfpose.scenario.records import (
+    ID_PATTERN,
     MAX_FRAME_SAMPLES,
+    MAX_ID_LENGTH,
+    MAX_SAMPLE_INDEX,
     MIN_FRAME_SAMPLES,
     SPEED_OF_LIGHT_MPS,
     CalibrationReceiver,
@@ -25,7 +28,10 @@ from rfpose.scenario.records import (
 from rfpose.scenario.simulation import Blockage, Dropout, Ground, Simulation
 
 __all__ = [
+    "ID_PATTERN",
     "MAX_FRAME_SAMPLES",
+    "MAX_ID_LENGTH",
+    "MAX_SAMPLE_INDEX",
     "MIN_FRAME_SAMPLES",
     "SPEED_OF_LIGHT_MPS",
     "Blockage",

@@ -13,11 +13,21 @@ from rfpose import geometry
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 MAX_FRAME_SAMPLES = 2**24
 MIN_FRAME_SAMPLES = 64
+MAX_SAMPLE_INDEX = 2**63 - 2**48
+"""Samples since the epoch that files count to; what is added to them, lengths of stretches, then still fits 64 bits."""
+MAX_SAMPLE_RATE_HZ = 1e12
+MIN_SAMPLE_RATE_HZ = 1e-3
+"""Rates are kept as ratios of two integers of 64 bits, the second at most a million."""
+MAX_START_UNIX_S = 250_000_000_000
+"""In the year 9892: dates end with 9999."""
+ID_PATTERN = r"^[A-Za-z0-9_.\-]*[A-Za-z0-9_\-][A-Za-z0-9_.\-]*$"
+"""Names become groups in files, and parts of file names: not `.` and `..`."""
+MAX_ID_LENGTH = 100
 
 Point = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-Identifier = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
+Identifier = Annotated[str, Field(min_length=1, max_length=MAX_ID_LENGTH, pattern=ID_PATTERN)]
 
 
 class Record(BaseModel):
@@ -39,7 +49,7 @@ class Site(Record):
 class Radio(Record):
     """The recorded band and how it is cut into frames."""
 
-    sample_rate_hz: Positive
+    sample_rate_hz: Annotated[float, Field(ge=MIN_SAMPLE_RATE_HZ, le=MAX_SAMPLE_RATE_HZ)]
     centre_frequency_hz: NonNegative
     frame_samples: Annotated[int, Field(ge=MIN_FRAME_SAMPLES, le=MAX_FRAME_SAMPLES)]
     propagation_speed_mps: Positive = SPEED_OF_LIGHT_MPS

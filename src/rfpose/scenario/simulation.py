@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from rfpose.scenario.records import Identifier, NonNegative, Positive, Record
+from rfpose.scenario.records import MAX_START_UNIX_S, Identifier, NonNegative, Positive, Record
 
 
 class Ground(Record):
@@ -43,7 +43,7 @@ class Simulation(Record):
     frame_count: Annotated[int, Field(gt=0)] = 4
     frame_interval_s: NonNegative = 0.0
     """Start to start; zero records frames back to back."""
-    start_unix_s: Annotated[int, Field(ge=0)] = 1_782_043_200
+    start_unix_s: Annotated[int, Field(ge=0, le=MAX_START_UNIX_S)] = 1_782_043_200
     tone_snr_db: float = 40.0
     """First tone of a transmitter of amplitude one at the reference range, against all noise in the recorded
     band, per sample: ``(a m)² / σ²`` with σ² the variance of the complex noise."""

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.scenario import Heliostat, Scenario
+from rfpose.scenario import MAX_SAMPLE_INDEX, Heliostat, Scenario
+from rfpose.scenario.records import MAX_START_UNIX_S
 
 __all__ = ["frame_start_index", "mirror_normal_enu", "ray_range_m", "receiver_enu_m"]
 
@@ -37,10 +38,15 @@ def frame_start_index(scenario: Scenario) -> npt.NDArray[np.int64]:
             "or give 0 for frames back to back"
         )
     first = round(simulation.start_unix_s * rate)
-    if first + (simulation.frame_count + 1) * interval >= 2**63:
+    if first + (simulation.frame_count + 1) * interval > MAX_SAMPLE_INDEX:
         raise ScenarioError(
             "sample counts since the epoch exceed 64 bits; reduce `simulation.start_unix_s`, "
             "`simulation.frame_interval_s` or `radio.sample_rate_hz`"
+        )
+    if simulation.start_unix_s + simulation.frame_count * interval / rate > MAX_START_UNIX_S:
+        raise ScenarioError(
+            "the last frame lies beyond the year 9892, and dates end with 9999; reduce `simulation.start_unix_s`, "
+            "`simulation.frame_count` or `simulation.frame_interval_s`"
         )
     return np.array([first + round(k * interval) for k in range(simulation.frame_count)], np.int64)
 
