@@ -22,3 +22,8 @@ class RecordingError(RfposeError, OSError):
 
 class GeometryError(RfposeError, ValueError):
     """Positions that admit no solution: coincident, collinear or coplanar points."""
+
+
+def install_remedy(extra: str) -> str:
+    """Return how to install an extra, in words that hold in a checkout and for an installed rfpose alike."""
+    return f"in a checkout of rfpose: `pip install '.[{extra}]'`; else: `pip install 'rfpose[{extra}]'`"

@@ -19,6 +19,7 @@ from typing import Any, Final
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 
 __all__ = [
+    "RATE_LIMITS",
     "TEXT_BYTES",
     "exact_number",
     "exact_rate",
@@ -37,7 +38,7 @@ _DEPTH: Final = 64
 _DIGITS: Final = 100
 _EXPONENT: Final = 100
 _LARGEST_DENOMINATOR: Final = 1_000_000
-_RATES: Final = (Fraction(1, 1000), Fraction(10**12))
+RATE_LIMITS: Final = (Fraction(1, 1000), Fraction(10**12))
 """Slower or faster than any receiver; within them a rate never rounds to zero."""
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?(\d+))?|[+-]?\d+/\d+", re.ASCII)
 _REMEDY: Final = "correct it or copy it again"
@@ -106,9 +107,10 @@ def exact_rate(name: str, value: Any) -> Fraction:
         As `exact_number`; or negative, zero, slower than 0.001/s or faster than 1e12/s.
     """
     rate = exact_number(name, value)
-    if not _RATES[0] <= rate <= _RATES[1]:
+    least, most = RATE_LIMITS
+    if not least <= rate <= most:
         raise InvalidInputError(
-            f"`{name}` must be a rate from {float(_RATES[0]):g} to {float(_RATES[1]):g} a second, got {_short(rate)}"
+            f"`{name}` must be a rate from {float(least):g} to {float(most):g} a second, got {_short(rate)}"
         )
     return rate if isinstance(value, numbers.Rational) else rate.limit_denominator(_LARGEST_DENOMINATOR)
 

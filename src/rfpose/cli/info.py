@@ -20,13 +20,14 @@ __all__ = ["command"]
         "rfpose info result.h5 --json",
         "rfpose info site.toml",
         "rfpose info models.json",
+        "rfpose info day.h5",
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
 @follow_links_option
 @common_options
 def command(file: Path, follow_links: bool) -> None:
-    """Say what a recording, a result, a scenario or a file of mounts holds and whether it is sound."""
+    """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound."""
     from rfpose.pipeline.inspect import inspect_file
 
     found = inspect_file(file, follow_links=follow_links)

@@ -14,8 +14,17 @@ import numpy as np
 from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.sun import unix_seconds
+from rfpose.foreign import read_text
 
 __all__ = ["Quantity", "read_series_csv"]
+
+
+_LONGEST_BYTES = 2**28
+"""Of a record's text: ten years of half minutes."""
+
+
+_MOST_SAMPLES = 2**28
+_LAST_UNIX_S = 253_402_300_799.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,10 +79,7 @@ def read_series_csv(
         be, fewer than two known samples. The message names file, line and remedy.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path}: must be a readable text file; {error}") from error
+    text = read_text(path, limit=_LONGEST_BYTES, error=InvalidInputError)
     seconds, values = _parse(path, text, quantity)
     known = np.isfinite(values)
     if known.sum() < 2:
@@ -82,6 +88,11 @@ def read_series_csv(
         )
     at, values = seconds[known], values[known]
     n = int(np.floor((at[-1] - at[0]) / as_positive("interval_s", interval_s) + 1e-9)) + 1
+    if n > _MOST_SAMPLES:
+        raise InvalidInputError(
+            f"{path}: spans {(at[-1] - at[0]) / 86400.0:.0f} days, {n} samples of {interval_s:g} s, more than fit into "
+            "memory; check its times, or give a part of it"
+        )
     grid = at[0] + interval_s * np.arange(n)
     even = np.interp(grid, at, values)
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, len(at) - 1)
@@ -97,8 +108,12 @@ def _parse(path: Path, text: str, quantity: Quantity) -> tuple[FloatArray, Float
     lines = [(i, line) for i, line in enumerate(io.StringIO(text), 1) if line.strip() and not line.startswith("#")]
     if not lines:
         raise InvalidInputError(f"{path}: must not be empty; the first line names columns such as time,{columns[0]}")
-    rows = list(csv.reader(line for _, line in lines))
+    rows = [_cells(path, number, line) for number, line in lines]
     header = [name.strip().lower() for name in rows[0]]
+    if len(header) == 1 and ";" in header[0]:
+        raise InvalidInputError(
+            f"{path}: columns are separated by `;`; save it with commas, and with points in numbers"
+        )
     clock = next((name for name in ("unix_s", "time") if name in header), None)
     unit = next((unit for unit, column in zip(quantity.units, columns, strict=True) if column in header), None)
     if clock is None or unit is None:
@@ -121,6 +136,14 @@ def _parse(path: Path, text: str, quantity: Quantity) -> tuple[FloatArray, Float
     return seconds, values
 
 
+def _cells(path: Path, number: int, line: str) -> list[str]:
+    try:
+        rows = list(csv.reader([line]))
+    except csv.Error as error:
+        raise InvalidInputError(f"{path}: line {number} is no CSV: {error}; correct it") from error
+    return rows[0] if rows else []
+
+
 def _moment(place: str, text: str, clock: str) -> float:
     if clock == "time":
         try:
@@ -134,8 +157,8 @@ def _moment(place: str, text: str, clock: str) -> float:
         value = float(text)
     except ValueError as error:
         raise InvalidInputError(f"{place}: `unix_s` must be a number of seconds, got {text!r}") from error
-    if not np.isfinite(value):
-        raise InvalidInputError(f"{place}: `unix_s` must be finite, got {text!r}")
+    if not 0.0 <= value <= _LAST_UNIX_S:
+        raise InvalidInputError(f"{place}: `unix_s` must be a time from 1970 to 9999, got {text!r:.60}")
     return value
 
 
@@ -147,7 +170,7 @@ def _value(place: str, text: str, quantity: Quantity, unit: str) -> float:
         value = float(text) * quantity.units[unit]
     except ValueError as error:
         raise InvalidInputError(f"{place}: `{column}` must be a number or empty, got {text!r}") from error
-    if value < 0.0:
+    if not value >= 0.0:
         raise InvalidInputError(f"{place}: `{column}` must not be negative, got {text}; mark gaps by an empty field")
     if value > quantity.most:
         raise InvalidInputError(

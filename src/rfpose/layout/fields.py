@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.foreign import read_text
 from rfpose.scenario import Scenario, check_scenario
 
 __all__ = ["cornfield", "radial_staggered", "read_positions", "with_field"]
@@ -37,15 +38,11 @@ def read_positions(path: str | Path) -> tuple[tuple[str, ...], FloatArray]:
         heliostats at one place; the message names file and line.
     """
     path = Path(path)
+    text = read_text(path, error=ScenarioError, remedy="positions are CSV in UTF-8: correct it")
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not a text file; positions are CSV in UTF-8") from error
-    rows = [
-        (k, row) for k, row in enumerate(csv.reader(text.splitlines()), start=1) if any(cell.strip() for cell in row)
-    ]
+        rows = [(k, row) for k, row in enumerate(csv.reader(text.splitlines()), start=1) if "".join(row).strip()]
+    except csv.Error as error:
+        raise ScenarioError(f"{path}: not CSV: {error}; correct it") from error
     if not rows:
         raise ScenarioError(f"{path}: empty; the first line must be the header `id,east_m,north_m,up_m`")
     header = [cell.strip() for cell in rows[0][1]]
@@ -100,6 +97,8 @@ def with_field(scenario: Scenario, ids: Sequence[str], pivot_enu_m: npt.ArrayLik
 
 
 def _check_header(path: Path, header: list[str]) -> None:
+    if len(header) == 1 and ";" in header[0]:
+        raise ScenarioError(f"{path}: columns are separated by `;`; save it with commas, and with points in numbers")
     if all(re.fullmatch(r"[-+\d.eE]+", cell) for cell in header if cell):
         raise ScenarioError(f"{path}: line 1 holds numbers, not a header; add the line `east_m,north_m,up_m` above it")
     for name in _COLUMNS[:2]:

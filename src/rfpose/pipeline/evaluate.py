@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.foreign import load_json
 from rfpose.geometry import angle_between_rad, unit
 from rfpose.multilat import FixStatus, PoseStatus, TrackStatus, position_bound
 from rfpose.multilat.integrity import TransmitterStatus
@@ -238,28 +238,42 @@ def read_truth(path: str | Path, scenario: Scenario, *, follow_links: bool = Fal
     return align_truth(truth, scenario)
 
 
+_TRUTH_BYTES = 2**28
+_TRUTH_REMEDY = (
+    "it must hold `heliostats`, a list with `id`, `normal_enu` [x, y, z] and `receivers_enu_m` [[x, y, z], …] of each"
+)
+
+
 def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
     normal_enu = np.full((1, len(scenario.heliostat_ids), 3), np.nan)
     receiver_enu_m = np.full((1, len(scenario.receiver_ids), 3), np.nan)
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["heliostats"]
-        for entry in entries:
-            if entry["id"] not in scenario.heliostat_ids:
-                continue
-            i = scenario.heliostat_ids.index(entry["id"])
-            rows = scenario.receiver_rows(i)
-            normal_enu[0, i] = unit(as_float_array("normal_enu", entry["normal_enu"], (3,)))
-            receiver_enu_m[0, rows] = as_float_array(
-                "receivers_enu_m", entry["receivers_enu_m"], (rows.stop - rows.start, 3)
-            )
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot read the truth: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        what = f"`{error.args[0]}` is missing" if isinstance(error, KeyError) else str(error)
-        raise RecordingError(
-            f"{path}: not a truth file: {what}; it must hold `heliostats`, each with `id`, `normal_enu` and "
-            "`receivers_enu_m`"
-        ) from error
+    content = load_json(path, limit=_TRUTH_BYTES, remedy=_TRUTH_REMEDY)
+    entries = content.get("heliostats") if isinstance(content, dict) else None
+    if not isinstance(entries, list):
+        raise RecordingError(f"{path}: not a truth file: `heliostats` is missing or no list; {_TRUTH_REMEDY}")
+    index = {name: i for i, name in enumerate(scenario.heliostat_ids)}
+    known = 0
+    for k, entry in enumerate(entries):
+        place = f"heliostats[{k}]"
+        for key in ("id", "normal_enu", "receivers_enu_m"):
+            if not isinstance(entry, dict) or key not in entry:
+                raise RecordingError(f"{path}: not a truth file: `{place}.{key}` is missing; {_TRUTH_REMEDY}")
+        i = index.get(entry["id"]) if isinstance(entry["id"], str) else None
+        if i is None:
+            continue
+        rows = scenario.receiver_rows(i)
+        try:
+            normal = as_float_array(f"{place}.normal_enu", entry["normal_enu"], (3,))
+            if not np.linalg.norm(normal) > 0.0:
+                raise InvalidInputError(f"`{place}.normal_enu` must not be zero")
+            shape = (rows.stop - rows.start, 3)
+            receiver_enu_m[0, rows] = as_float_array(f"{place}.receivers_enu_m", entry["receivers_enu_m"], shape)
+        except InvalidInputError as error:
+            raise RecordingError(f"{path}: not a truth file: {error}; {_TRUTH_REMEDY}") from error
+        normal_enu[0, i] = unit(normal)
+        known += 1
+    if not known:
+        raise RecordingError(f"{path}: knows none of the result's heliostats ({', '.join(list(index)[:5])}, …)")
     return Truth(
         heliostat_ids=scenario.heliostat_ids,
         receiver_ids=scenario.receiver_ids,
@@ -384,6 +398,7 @@ def _filtered(result: Result, normal_true: FloatArray) -> FilteredErrors | None:
     if table is None:
         return None
     given = np.isfinite(table.sigma_rad) & np.isfinite(normal_true).all(axis=-1)
+    given &= np.isfinite(table.normal_enu).all(axis=-1) & np.isfinite(table.cov_enu).all(axis=(-2, -1))
     off = (table.normal_enu - normal_true)[given]
     # the normal has two angles: its covariance is singular along itself
     inverse = np.linalg.pinv(table.cov_enu[given], rcond=1e-10, hermitian=True)

@@ -13,6 +13,7 @@ __all__ = ["DAMAGES", "array_of", "format_of", "text_of"]
 DAMAGES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 """What h5py and numpy raise where a file is not what it says."""
 
+_LARGEST = 1e50
 _ALWAYS_READ_BYTES = 2**26
 _MOST_COMPRESSED = 1100
 """Deflate makes no more than some 1030 bytes of one."""
@@ -51,9 +52,15 @@ def array_of(dataset: h5py.Dataset, dtype: Any) -> np.ndarray[Any, Any]:
     Raises
     ------
     ValueError
-        The dataset says that it holds more than the file can: reading it would only fill memory.
+        The dataset says that it holds more than the file can: reading it would only fill memory. A number is larger
+        than anything that is measured, and would overflow when it is squared.
     """
     stored = dataset.id.get_storage_size()
     if dataset.nbytes > max(_ALWAYS_READ_BYTES, _MOST_COMPRESSED * stored):
         raise ValueError(f"claims {dataset.nbytes} bytes, and {stored} are stored")
-    return np.asarray(dataset[()], dtype=dtype)
+    values = np.asarray(dataset[()], dtype=dtype)
+    if values.dtype.kind in "fc" and values.size:
+        finite = np.where(np.isfinite(values), np.abs(values), 0.0)
+        if finite.max() > _LARGEST:
+            raise ValueError(f"holds {values.ravel()[int(np.argmax(finite))]:.3g}, which nothing measured is")
+    return values

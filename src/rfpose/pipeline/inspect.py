@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from rfpose.errors import GeometryError, ScenarioError
+from rfpose.errors import GeometryError, RecordingError, ScenarioError
+from rfpose.kinds import kind_of
 from rfpose.pipeline.choice import POSES
-from rfpose.pipeline.mount_file import is_model, read_models
+from rfpose.pipeline.mount_file import read_models
 from rfpose.pipeline.result import frame_time
-from rfpose.pipeline.result_file import is_result, read_result
+from rfpose.pipeline.result_file import read_result
 from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.solve import check_solvable
+from rfpose.pipeline.track_file import read_track
 from rfpose.recording import describe, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
@@ -20,7 +23,7 @@ __all__ = ["inspect_file"]
 
 
 def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, Any]:
-    """Describe a recording, a result, a scenario or a file of mounts, ready for JSON.
+    """Describe a recording, a result, a tracking run, a scenario or a file of mounts, ready for JSON.
 
     Parameters
     ----------
@@ -32,8 +35,8 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
     Returns
     -------
     dict
-        ``kind`` is ``"recording"``, ``"result"``, ``"scenario"`` or ``"model"`` (mounts); ``sound`` tells whether
-        ``problems`` is empty.
+        ``kind`` is ``"recording"``, ``"result"``, ``"track"`` (a tracking run), ``"scenario"`` or ``"model"`` (mounts);
+        ``sound`` tells whether ``problems`` is empty.
 
     Raises
     ------
@@ -41,12 +44,14 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
         The file is missing, damaged or none of these.
     """
     path = Path(path)
-    if path.suffix in (".json", ".toml") and is_model(path):
-        return {"kind": "model", "path": str(path), **_models(path)}
-    if path.suffix == ".toml":
+    kind = kind_of(path)
+    readers = {"model": _models, "result": _result, "track": _track}
+    if kind in readers:
+        return {"kind": kind, "path": str(path), **readers[kind](path)}
+    if kind == "truth":
+        raise RecordingError(f"{path}: a truth, which `rfpose evaluate --truth` takes; give it there with its result")
+    if kind == "scenario" or path.suffix == ".toml":
         return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
-    if path.is_file() and is_result(path):
-        return {"kind": "result", "path": str(path), **_result(path)}
     with open_recording(path, follow_links=follow_links) as recording:
         return {"kind": "recording", **describe(recording)}
 
@@ -92,6 +97,38 @@ def _result(path: Path) -> dict[str, Any]:
         "last_frame_utc": times[1],
         **{key: value for key, value in summary.items() if key not in ("estimator", "pose")},
         "has_truth": result.truth is not None,
+        "problems": problems,
+        "sound": not problems,
+    }
+
+
+def _track(path: Path) -> dict[str, Any]:
+    track = read_track(path)
+    times = (
+        [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[[0, -1]]] if len(track.unix_s) else []
+    )
+    problems = [
+        f"{name}: no error was scored" for name, m in track.methods.items() if m.summary["normal_mrad"]["rms"] is None
+    ]
+    return {
+        "scenario": track.scenario.name,
+        "settings": dict(track.settings),
+        "heliostats": len(track.heliostat_ids),
+        "heliostats_with_courses": [track.heliostat_ids[i] for i in track.stored],
+        "days": list(track.dates),
+        "first_instant_utc": times[0] if times else None,
+        "last_instant_utc": times[-1] if times else None,
+        "instants": len(track.unix_s),
+        "field_control": "on" if any(m.happened for m in track.methods.values()) else "off",
+        "methods": {
+            name: {
+                "rms_mrad": m.summary["normal_mrad"]["rms"],
+                "worst_mrad": m.summary["normal_mrad"]["worst"],
+                "intercept": m.summary["intercept"],
+                "energy_kwh_per_m2": m.summary["energy_kwh_per_m2"],
+            }
+            for name, m in ((name, track.methods[name]) for name in track.ranking())
+        },
         "problems": problems,
         "sound": not problems,
     }

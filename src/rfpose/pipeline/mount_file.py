@@ -23,13 +23,15 @@ from rfpose.feedback.calibrated import Choice, Known, resolve_free
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.feedback.sun import Site, site_from_degrees
 from rfpose.foreign import load_json, load_toml
+from rfpose.kinds import kind_of
 from rfpose.pipeline.files import refuse_existing, write_atomically
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "is_model", "read_models", "write_model_file"]
 
 MODEL_FORMAT = "rfpose-mount"
 MODEL_VERSION = 1
-_LARGEST_BYTES = 2**28  # ten thousand calibrated heliostats are 100 MB
+_MODEL_BYTES = 2**28
+"""Of ten thousand calibrated mounts with their covariances."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,10 +95,7 @@ class MountFile:
 
 def is_model(path: str | Path) -> bool:
     """Tell whether a file says that it holds mounts; false for whatever cannot be read."""
-    try:
-        return _load(Path(path)).get("format") == MODEL_FORMAT
-    except RecordingError:
-        return False
+    return kind_of(path) == "model"
 
 
 def write_model_file(
@@ -228,7 +227,11 @@ def read_models(path: str | Path) -> MountFile:
 
 def _load(path: Path) -> dict[str, Any]:
     load = load_toml if path.suffix == ".toml" else load_json
-    content = load(path, limit=_LARGEST_BYTES, remedy="give what `rfpose calibrate -o` wrote, .json or .toml")
+    content = load(
+        path,
+        limit=_MODEL_BYTES,
+        remedy="mounts are JSON or TOML by the file's ending: give what `rfpose calibrate -o` wrote",
+    )
     if not isinstance(content, dict):
         raise RecordingError(f"{path}: must hold one object, got a {type(content).__name__}")
     return content

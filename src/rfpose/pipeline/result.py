@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.errors import InvalidInputError
+from rfpose.foreign import exact_number
 from rfpose.multilat import RangeDifferences
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
@@ -253,8 +253,6 @@ class Result:
 LAST_TIME_S = 253_402_300_799
 """The last second of the year 9999, after which there are no dates."""
 
-_RATE = re.compile(r"[0-9]{1,40}(/[0-9]{1,40})?")
-
 
 def rate_of(settings: Mapping[str, str]) -> Fraction:
     """Return the sample rate that settings name, as a number or a ratio of two [1/s].
@@ -264,11 +262,10 @@ def rate_of(settings: Mapping[str, str]) -> Fraction:
     InvalidInputError
         It is none, or not greater than zero.
     """
-    text = settings.get("sample_rate", "")
-    numerator, _, denominator = text.partition("/")
-    if not _RATE.fullmatch(text) or not int(numerator) or not int(denominator or 1):
-        raise InvalidInputError(f"`sample_rate` must be a number greater than zero or a ratio of two, got {text!r:.60}")
-    return Fraction(text)
+    rate = exact_number("sample_rate", settings["sample_rate"])
+    if rate <= 0:
+        raise InvalidInputError(f"`sample_rate` must be greater than zero, got {settings['sample_rate']!r}")
+    return rate
 
 
 def frame_time(start_index: int, sample_rate: Fraction) -> datetime:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.kinds import told_kind
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -246,6 +247,8 @@ def read_result(path: str | Path) -> Result:
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path}: no such file; make it with `rfpose process`")
+    if instead := told_kind(path, wanted="result"):
+        raise RecordingError(f"{path}: no result, but {instead}; give what `rfpose process` wrote")
     try:
         with h5py.File(path, "r") as file:
             return _Reader(path, file).result()

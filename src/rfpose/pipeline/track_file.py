@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import RecordingError, ScenarioError
@@ -21,7 +24,11 @@ from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.feedback.tracking._kernels import RADIO
 from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
+from rfpose.foreign import parse_json
+from rfpose.kinds import told_kind
 from rfpose.pipeline.files import write_atomically
+from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
+from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.scenario import Scenario, parse_scenario
 
@@ -64,6 +71,8 @@ _SCORES = {
     "day_intercept": ("1", "day", "by day"),
     "by_mode": ("s, J/m²", "mode, seconds-offered-caught", "time and light of a mirror in each mode, all days"),
 }
+_INTEGERS = ("mode_count", "mode", "stored", "day")
+MODE_NAMES = tuple(mode.name.lower() for mode in Mode)
 _FIELD = {
     "heliostat/pivot_enu_m": ("m", "heliostat, xyz", "nominal pivots"),
     "heliostat/target_enu_m": ("m", "heliostat, xyz", "aim points; NaN for a dish"),
@@ -261,7 +270,7 @@ def write_track(track: Track, path: str | Path) -> None:
             settings.attrs[name] = text
         _texts(file, "heliostat/id", track.heliostat_ids)
         _texts(file, "day/date", track.dates)
-        _texts(file, "mode/name", tuple(mode.name.lower() for mode in Mode))
+        _texts(file, "mode/name", MODE_NAMES)
         for place, name in (
             ("heliostat/pivot_enu_m", "pivot_enu_m"),
             ("heliostat/target_enu_m", "target_enu_m"),
@@ -297,65 +306,218 @@ def _texts(file: h5py.File, place: str, texts: tuple[str, ...]) -> None:
 
 def is_track(path: str | Path) -> bool:
     """Tell whether a file says that it is an rfpose-tracking; false for whatever cannot be opened."""
-    try:
-        with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("format") == FORMAT)
-    except OSError:
-        return False
+    return format_of(path) == FORMAT
 
 
 def read_track(path: str | Path) -> Track:
-    """Read a run.
+    """Read a tracking run.
 
     Raises
     ------
     RecordingError
-        Missing, not HDF5, another format or version, or something is missing in it; the message names the place.
+        Missing, truncated, another format or version, or something in it is missing, of another type or shape, or says
+        what no run says; the message names the file and the place.
     """
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path}: no such file; make it with `rfpose track`")
+    if instead := told_kind(path, wanted="track"):
+        raise RecordingError(f"{path}: no tracking run, but {instead}; give what `rfpose track` wrote")
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
                 raise RecordingError(f"{path}: is no {FORMAT} of version {VERSION}; make it with `rfpose track`")
-            return _read(file, path)
+            return _Reader(path, file).track()
     except RecordingError:
         raise
-    except ScenarioError as error:
-        raise RecordingError(f"{path}: its scenario is damaged ({error}); run `rfpose track` again") from error
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except DAMAGES as error:
         raise RecordingError(
-            f"{path}: cannot be read as {FORMAT} ({error}); it is truncated or another kind of file: run again"
+            f"{path}: cannot be read as {FORMAT} ({error}); it is truncated or another kind of file: {_AGAIN}"
         ) from error
 
 
-def _read(file: h5py.File, path: Path) -> Track:
-    methods = {}
-    for name in json.loads(file.attrs["methods"]):
-        group = file[f"method/{name}"]
-        methods[name] = MethodTrack(
+_AGAIN = "run `rfpose track` again"
+
+
+class _Checked(BaseModel):
+    """A part of a method's JSON that something shows; what else stands there may be anything."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _Errors(_Checked):
+    rms: float | None
+    p95: float | None
+    worst: float | None
+
+
+class _OfMode(_Checked):
+    hours: float
+    offered_kwh_per_m2: float
+    lost_kwh_per_m2: float
+
+
+class _Summary(_Checked):
+    normal_mrad: _Errors
+    intercept: float | None
+    availability: float | None
+    energy_kwh_per_m2: float
+    modes: dict[Literal[MODE_NAMES], _OfMode]  # type: ignore[valid-type]
+
+
+class _Event(_Checked):
+    hour: float
+    what: str
+    heliostats: int
+    refused: dict[str, int] = {}
+
+
+class _Alarm(_Checked):
+    hour: float
+    alarm: str
+    below_tenth_s: float | None
+    off_s: float | None
+    stowed_median_s: float | None
+    stowed_s: float | None
+
+
+class _Calibration(_Checked):
+    heliostat: str
+    outcome: str
+    searched: bool
+    took_s: float
+    offset_mm: list[float] | None
+
+
+class _Messages(_Checked):
+    __pydantic_extra__: dict[str, int]
+    orders_sent: int
+    orders_refused: int
+    watchdog_emergencies: int
+
+
+class _Happened(_Checked):
+    events: list[_Event]
+    alarms: list[_Alarm]
+    calibrations: list[_Calibration]
+    messages: _Messages
+
+
+_HAPPENED = TypeAdapter(list[_Happened])
+_TEXTS = TypeAdapter(list[str])
+_TABLES = TypeAdapter(list[dict[str, Any]])
+_SUMMARY = TypeAdapter(_Summary)
+
+
+class _Reader:
+    """Reads one open file; each complaint names the file and the place in it."""
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self._path = path
+        self._file = file
+        self._length = {"xyz": 3, "axis": 2, "hour": 24, "mode": len(Mode), "seconds-offered-caught": 3}
+
+    def track(self) -> Track:
+        ids, dates = self._names("heliostat/id"), self._names("day/date")
+        self._length |= {"heliostat": len(ids), "day": len(dates)}
+        field = {place.partition("/")[2]: self._array(place, key[1]) for place, key in _FIELD.items()}
+        self._check_index("heliostat/stored", field["stored"], 0, len(ids))
+        self._check_index("time/day", field["day"], 0, len(dates))
+        late = ~((field["unix_s"] >= 0.0) & (field["unix_s"] <= LAST_TIME_S))
+        if late.any():
+            raise self._error("time/unix_s", f"holds {field['unix_s'][late][0]}, no time until the year 9999")
+        for date in dates:
+            try:
+                datetime.date.fromisoformat(date)
+            except ValueError as error:
+                raise self._error("day/date", f"holds {date!r:.40}, which is no date") from error
+        settings = {name: str(value) for name, value in self._group("settings").attrs.items()}
+        if not re.fullmatch(r"[0-9]{1,20}", settings.get("seed", "")):
+            raise self._error("settings", "lacks the attribute `seed`, or it is no number")
+        try:
+            scenario = parse_scenario(text_of(self._file.get("scenario")), source=f"{self._path}:/scenario")
+        except ScenarioError as error:
+            raise RecordingError(f"{error}; the run is damaged: {_AGAIN}") from error
+        except ValueError as error:
+            raise self._error("scenario", str(error)) from error
+        return Track(
+            scenario=scenario,
+            settings=settings,
+            heliostat_ids=ids,
+            dates=dates,
+            methods={name: self._method(name) for name in self._json(_TEXTS, "methods", self._file)},
+            iq=tuple(self._json(_TABLES, "iq")),
+            **field,
+        )
+
+    def _method(self, name: str) -> MethodTrack:
+        place = f"method/{name}"
+        group = self._group(place)
+        series = {key: self._array(f"{place}/{key}", axes) for key, (_, axes, _) in _SERIES.items()}
+        self._check_index(f"{place}/mode", series["mode"], -1, len(Mode))
+        return MethodTrack(
             name=name,
             text=str(group.attrs.get("text", METHODS[name].text if name in METHODS else name)),
-            series={key: read_only(group[key][()]) for key in _SERIES},
-            scores={key: read_only(group[f"score/{key}"][()]) for key in _SCORES},
-            summary=json.loads(group.attrs["summary"]),
-            happened=tuple(json.loads(group["happened"].asstr()[()])),
+            series=series,
+            scores={key: self._array(f"{place}/score/{key}", axes) for key, (_, axes, _) in _SCORES.items()},
+            summary=self._json(_SUMMARY, f"{place} summary", group),
+            happened=tuple(self._json(_HAPPENED, f"{place}/happened")),
         )
-    return Track(
-        scenario=parse_scenario(file["scenario"].asstr()[()], source=f"{path}, scenario"),
-        settings={name: str(value) for name, value in file["settings"].attrs.items()},
-        heliostat_ids=tuple(file["heliostat/id"].asstr()[()].tolist()),
-        pivot_enu_m=read_only(file["heliostat/pivot_enu_m"][()]),
-        target_enu_m=read_only(file["heliostat/target_enu_m"][()]),
-        stored=read_only(file["heliostat/stored"][()]),
-        dates=tuple(file["day/date"].asstr()[()].tolist()),
-        unix_s=read_only(file["time/unix_s"][()]),
-        day=read_only(file["time/day"][()]),
-        sun_enu=read_only(file["time/sun_enu"][()]),
-        methods=methods,
-        iq=tuple(json.loads(file["iq"].asstr()[()])),
-    )
+
+    def _error(self, place: str, what: str) -> RecordingError:
+        return RecordingError(f"{self._path}: `/{place}` {what}; the run is damaged: {_AGAIN}")
+
+    def _group(self, place: str) -> h5py.Group:
+        found = self._file.get(place)
+        if not isinstance(found, h5py.Group):
+            raise self._error(place, "is missing or no group")
+        return found
+
+    def _names(self, place: str) -> tuple[str, ...]:
+        dataset = self._file.get(place)
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or not h5py.check_string_dtype(dataset.dtype):
+            raise self._error(place, "is missing or no list of texts")
+        try:
+            return tuple(dataset.asstr()[()].tolist())
+        except DAMAGES as error:
+            raise self._error(place, f"cannot be read ({error})") from error
+
+    def _json(self, wanted: TypeAdapter[Any], place: str, group: h5py.Group | None = None) -> Any:
+        """Return what a text says; that of an attribute of ``group``, named by the place's last word, if given."""
+        try:
+            raw = text_of(self._file.get(place)) if group is None else group.attrs[place.rpartition(" ")[2]]
+        except DAMAGES as error:
+            raise self._error(place, f"is missing or no text ({error})") from error
+        if not isinstance(raw, str):
+            raise self._error(place, "is no text")
+        found = parse_json(raw, source=f"{self._path}: `/{place}`", remedy=f"the run is damaged: {_AGAIN}")
+        try:
+            wanted.validate_python(found)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise self._error(place, f"`{where}`: {first['msg'][:1].lower()}{first['msg'][1:]}") from error
+        return found
+
+    def _array(self, place: str, axes: str) -> npt.NDArray[Any]:
+        dataset = self._file.get(place)
+        name = place.rpartition("/")[2]
+        kind = "iu" if name in _INTEGERS else "f"
+        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kind:
+            raise self._error(place, f"is missing or holds no {'integers' if kind == 'iu' else 'numbers'}")
+        wanted = axes.split(", ")
+        lengths = [self._length.setdefault(axis, n) for axis, n in zip(wanted, dataset.shape, strict=False)]
+        if len(wanted) != dataset.ndim or tuple(lengths) != dataset.shape:
+            raise self._error(place, f"has shape {dataset.shape}, not ({axes})")
+        try:
+            return read_only(array_of(dataset, dataset.dtype.newbyteorder("=")))
+        except DAMAGES as error:
+            raise self._error(place, str(error)) from error
+
+    def _check_index(self, place: str, values: npt.NDArray[Any], least: int, end: int) -> None:
+        bad = values[(values < least) | (values >= end)]
+        if bad.size:
+            raise self._error(place, f"holds {bad[0]}, which means nothing")
 
 
 def write_track_csv(track: Track, path: str | Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import h5py
 import numpy as np
 
-from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 from rfpose.foreign import exact_number, exact_rate
 from rfpose.recording.base import IndexArray, IqArray, Recording, SampleFormat
 from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
@@ -48,7 +48,7 @@ def import_digital_rf() -> Any:
         import digital_rf
     except ImportError as error:
         raise RecordingError(
-            f"Digital RF needs the digital_rf library ({error}); install it with `pip install 'rfpose[digital-rf]'`"
+            f"Digital RF needs the digital_rf library ({error}); install it, {install_remedy('digital-rf')}"
         ) from error
     return digital_rf
 

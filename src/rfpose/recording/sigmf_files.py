@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
-from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 from rfpose.foreign import exact_number, exact_rate, load_json
 from rfpose.recording.base import COMPONENT_DTYPE, IndexArray, IqArray, Recording, SampleFormat
 from rfpose.recording.links import FOLLOW, refuse_outside
@@ -35,7 +35,7 @@ def import_sigmf() -> Any:
         import sigmf
     except ImportError as error:
         raise RecordingError(
-            f"SigMF needs the sigmf library ({error}); install it with `pip install 'rfpose[sigmf]'`"
+            f"SigMF needs the sigmf library ({error}); install it, {install_remedy('sigmf')}"
         ) from error
     return sigmf
 

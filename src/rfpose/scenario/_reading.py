@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from rfpose.errors import ScenarioError
+from rfpose.foreign import parse_toml, read_text
+from rfpose.kinds import told_kind
 from rfpose.scenario._scenario import Scenario
 from rfpose.scenario.records import Mirror
+
+SCENARIO_BYTES = 2**26
+"""Of a scenario's text: a hundred thousand heliostats."""
+
+_REMEDY = "a scenario is TOML in UTF-8, as docs/scenario.md has it: correct it"
 
 
 def load_scenario(path: str | Path, *, scale: float | None = None) -> Scenario:
@@ -30,22 +36,15 @@ def load_scenario(path: str | Path, *, scale: float | None = None) -> Scenario:
         The file is missing, is not TOML, has unknown or mistyped keys, or contradicts itself. The message
         names the file, the key and the remedy.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot read the scenario: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not a text file; a scenario is TOML in UTF-8") from error
+    if instead := told_kind(path, wanted="scenario"):
+        raise ScenarioError(f"{path}: no scenario, but {instead}; give a site in TOML, as docs/scenario.md has it")
+    text = read_text(path, limit=SCENARIO_BYTES, error=ScenarioError, remedy=_REMEDY)
     return parse_scenario(text, source=str(path), scale=scale)
 
 
 def parse_scenario(text: str, *, source: str = "scenario", scale: float | None = None) -> Scenario:
     """Check a scenario given as TOML text; see `load_scenario`. ``source`` names it in messages."""
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{source}: not valid TOML: {error}") from error
+    data = parse_toml(text, source=source, error=ScenarioError, remedy=_REMEDY)
     try:
         file_scale = data.pop("scale", 1.0)
         if not isinstance(file_scale, int | float) or isinstance(file_scale, bool):

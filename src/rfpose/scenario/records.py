@@ -9,15 +9,13 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfpose import geometry
+from rfpose.foreign import RATE_LIMITS, exact_rate
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 MAX_FRAME_SAMPLES = 2**24
 MIN_FRAME_SAMPLES = 64
 MAX_SAMPLE_INDEX = 2**63 - 2**48
 """Samples since the epoch that files count to; what is added to them, lengths of stretches, then still fits 64 bits."""
-MAX_SAMPLE_RATE_HZ = 1e12
-MIN_SAMPLE_RATE_HZ = 1e-3
-"""Rates are kept as ratios of two integers of 64 bits, the second at most a million."""
 MAX_START_UNIX_S = 250_000_000_000
 """In the year 9892: dates end with 9999."""
 ID_PATTERN = r"^[A-Za-z0-9_.\-]*[A-Za-z0-9_\-][A-Za-z0-9_.\-]*$"
@@ -49,7 +47,7 @@ class Site(Record):
 class Radio(Record):
     """The recorded band and how it is cut into frames."""
 
-    sample_rate_hz: Annotated[float, Field(ge=MIN_SAMPLE_RATE_HZ, le=MAX_SAMPLE_RATE_HZ)]
+    sample_rate_hz: Annotated[float, Field(ge=float(RATE_LIMITS[0]), le=float(RATE_LIMITS[1]))]
     centre_frequency_hz: NonNegative
     frame_samples: Annotated[int, Field(ge=MIN_FRAME_SAMPLES, le=MAX_FRAME_SAMPLES)]
     propagation_speed_mps: Positive = SPEED_OF_LIGHT_MPS
@@ -59,7 +57,7 @@ class Radio(Record):
     @property
     def sample_rate(self) -> Fraction:
         """Sample rate as a rational number [1/s]."""
-        return Fraction(self.sample_rate_hz).limit_denominator(1_000_000)
+        return exact_rate("sample_rate_hz", self.sample_rate_hz)
 
 
 class Tone(Record):

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rfpose.errors import RfposeError
+from rfpose.errors import RfposeError, install_remedy
 
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QApplication
@@ -59,7 +59,7 @@ def check_installed() -> None:
     """
     missing = [name for name in ("PySide6", "pyqtgraph") if importlib.util.find_spec(name) is None]
     if missing:
-        raise RfposeError(f"the viewer needs {' and '.join(missing)}; install the extra: pip install 'rfpose[gui]'")
+        raise RfposeError(f"the viewer needs {' and '.join(missing)}; install them, {install_remedy('gui')}")
     import PySide6
 
     if sys.version_info < (3, 12) and PySide6.__version__.startswith("6.12.0"):
@@ -74,7 +74,7 @@ def check_installed() -> None:
 def _missing_library(text: str) -> str:
     found = re.search(r"(lib[\w.+-]+?\.so)[\w.]*: cannot open shared object", text)
     if found is None:
-        return f"PySide6 cannot be loaded ({text}); install it anew: pip install --force-reinstall 'rfpose[gui]'"
+        return f"PySide6 cannot be loaded ({text}); install it anew: pip install --force-reinstall PySide6-Essentials"
     package = DEBIAN_PACKAGES.get(found.group(1))
     remedy = f"apt install {package}" if package else f"install the system package that holds {found.group(1)}"
     return f"Qt lacks the library {found.group(1)}; install it (Debian, Ubuntu: {remedy})"

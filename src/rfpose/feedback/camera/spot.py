@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 
 __all__ = ["Spot", "SpotStatus", "as_grey", "no_spot", "read_picture", "skimage"]
 
@@ -74,7 +74,7 @@ def skimage(part: str) -> Any:
     try:
         return importlib.import_module(f"skimage.{part}")
     except ImportError as error:
-        raise InvalidInputError("pictures need scikit-image: pip install 'rfpose[images]'") from error
+        raise InvalidInputError(f"pictures need scikit-image; install it, {install_remedy('images')}") from error
 
 
 def as_grey(image: npt.ArrayLike) -> FloatArray:

@@ -1,0 +1,68 @@
+"""Which kind of ours a file is: for those who were given another than they read, and for who takes anything."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+__all__ = ["FORMAT_KINDS", "kind_of", "told_kind"]
+
+FORMAT_KINDS = {
+    "rfpose-iq": "recording",
+    "rfpose-result": "result",
+    "rfpose-tracking": "track",
+    "rfpose-mount": "model",
+}
+"""Kinds by the format that files give themselves."""
+
+_WORDS = {
+    "recording": "a recording, which `rfpose process`, `rfpose convert`, `rfpose info` and `rfpose view` take",
+    "result": "a result of `rfpose process`, which `rfpose evaluate`, `rfpose info` and `rfpose view` take",
+    "track": "a run of `rfpose track`, which `rfpose info` and `rfpose view` take",
+    "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate --mount` and `rfpose info` take",
+    "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
+    "truth": "a truth, which `rfpose evaluate --truth` takes",
+}
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_HEAD_BYTES = 2**16
+
+
+def kind_of(path: str | Path) -> str | None:
+    """Return ``recording``, ``result``, ``track``, ``model``, ``scenario`` or ``truth``; None: nothing that is known.
+
+    By what a file says of itself at its beginning; whether it is sound is for its reader to say.
+    """
+    path = Path(path)
+    if path.suffix in (".sigmf", ".sigmf-meta", ".sigmf-data"):
+        return "recording"
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except (OSError, ValueError):
+        return None
+    if head.startswith(_HDF5):
+        return _kind_of_hdf5(path)
+    text = head.decode("utf-8-sig", errors="replace")
+    named = re.search(r"""^[\s{]*"?format"?\s*[:=]\s*["']([a-z-]+)["']""", text, re.MULTILINE)
+    if named is not None and named[1] in FORMAT_KINDS:
+        return FORMAT_KINDS[named[1]]
+    if re.match(r"\s*\{", text):
+        return "truth" if '"heliostats"' in text else None
+    return "scenario" if re.search(r"^\s*\[\[?(radio|transmitter|heliostat|tone)\]", text, re.MULTILINE) else None
+
+
+def _kind_of_hdf5(path: Path) -> str | None:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            found = file.attrs.get("format")
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+        return None
+    return FORMAT_KINDS.get(found) if isinstance(found, str) else None
+
+
+def told_kind(path: str | Path, *, wanted: str) -> str:
+    """Return what a file is instead of what is wanted, and which commands take it; empty where nothing is known."""
+    kind = kind_of(path)
+    return "" if kind is None or kind == wanted else _WORDS[kind]

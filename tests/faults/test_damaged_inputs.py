@@ -1,0 +1,261 @@
+"""Whatever is in a scenario, a truth, a result or a tracking run: our own errors that name the file, or none."""
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from damage import as_json, copied, damage_bytes, damage_hdf5, damage_values
+from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.feedback.series import Quantity, read_series_csv
+from rfpose.layout.fields import read_positions
+from rfpose.pipeline.evaluate import evaluate, read_truth
+from rfpose.pipeline.field_view import field_of_result, field_of_scenario, history
+from rfpose.pipeline.inspect import inspect_file
+from rfpose.pipeline.process import process
+from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_summary import write_poses_csv
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.track import track
+from rfpose.pipeline.track_file import read_track, write_track_csv
+from rfpose.pipeline.track_view import picture_of_track
+from rfpose.scenario import Scenario, check_scenario, load_scenario
+
+# what is wrong may well give NaN, of which numpy warns
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+
+
+def small_site() -> Scenario:
+    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
+    data["heliostat"] = data["heliostat"][:2]
+    data["radio"]["frame_samples"] = 4000
+    data["simulation"] |= {"frame_count": 3, "ground": {"coefficient": [-0.1, 0.05]}}
+    data["reflection"] = {
+        "model": "estimate",
+        "plane": [{"name": "wall", "point_enu_m": [300, 0, 0], "normal_enu": [-1, 0, 0]}],
+    }
+    data["motion"] = {"filtered": True}
+    return check_scenario(data)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("sound")
+    paths = {name: folder / f"{name}.h5" for name in ("recording", "result")}
+    paths["scenario"] = folder / "site.toml"
+    paths["scenario"].write_text(small_site().to_toml())
+    simulate_recording(paths["scenario"], paths["recording"], seed=1)
+    process(paths["recording"], paths["result"], estimator="correlator")
+    return paths
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("tracked")
+    day = load_scenario(DATA / "tracking_100m.toml").model_dump(exclude_none=True)
+    day["heliostat"] = day["heliostat"][:3]
+    day["tracking"] |= {"first_hour": 11.0, "last_hour": 11.3, "settle_s": 60.0}
+    day["tracking"]["event"] = [{"hour": 11.2, "what": "emergency"}]
+    (folder / "day.toml").write_text(check_scenario(day).to_toml())
+    track(folder / "day.toml", folder / "run.h5", methods=("radio", "open-loop"))
+    return folder / "run.h5"
+
+
+def refused(path: Path, read, how: str):
+    """Return what is read, or None where it is refused in our words, with the file's name."""
+    try:
+        return read(path)
+    except RfposeError as error:
+        message = str(error)
+    assert path.name in message, f"{how}: {message}"
+    assert len(message) < 2000
+    return None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_damaged_results(files, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    for k in range(25):
+        path = copied(files["result"], tmp_path)
+        how = damage_bytes(path, rng) if k % 5 == 0 else damage_hdf5(path, rng)
+        try:
+            refused(path, inspect_file, how)
+            result = refused(path, read_result, how)
+            if result is None:
+                continue
+            write_poses_csv(result, tmp_path / "poses.csv")
+            field_of_result(result)
+            history(result, 0)
+            with contextlib.suppress(RfposeError):
+                evaluate(result)
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {how}: {error!r}") from error
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_damaged_tracking_runs(tracked, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    for k in range(25):
+        path = copied(tracked, tmp_path)
+        how = damage_bytes(path, rng) if k % 5 == 0 else damage_hdf5(path, rng)
+        try:
+            refused(path, inspect_file, how)
+            run = refused(path, read_track, how)
+            if run is not None:
+                run.as_dict()
+                picture_of_track(run)
+                write_track_csv(run, tmp_path / "run.csv")
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {how}: {error!r}") from error
+
+
+def test_damaged_values_in_a_runs_tables(tracked, tmp_path):
+    import h5py
+
+    rng = np.random.default_rng(7)
+    for k in range(120):
+        path = copied(tracked, tmp_path)
+        with h5py.File(path, "r+") as file:
+            group = file["method/radio"]
+            if k % 2:
+                table = json.loads(group.attrs["summary"])
+                how = damage_values(table, rng)
+                group.attrs["summary"] = as_json(table)
+            else:
+                table = json.loads(group["happened"].asstr()[()])
+                how = damage_values(table, rng)
+                del group["happened"]
+                group["happened"] = as_json(table)
+        try:
+            run = refused(path, read_track, how)
+            if run is not None:
+                run.as_dict()
+                picture_of_track(run)
+        except Exception as error:
+            raise AssertionError(f"{k}, {how}: {error!r}") from error
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_damaged_scenarios(files, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    whole = load_scenario(DATA / "tracking_100m.toml").model_dump(mode="json", exclude_none=True)
+    whole["heliostat"] = whole["heliostat"][:2]
+    small = small_site().model_dump(mode="json", exclude_none=True)
+    for k in range(60):
+        path = tmp_path / "damaged.toml"
+        if k % 6 == 0:
+            path.write_text(tomli_w.dumps(small))
+            how = damage_bytes(path, rng)
+        else:
+            data = json.loads(json.dumps(small if k % 2 else whole))
+            how = damage_values(data, rng)
+            try:
+                path.write_text(tomli_w.dumps(data), encoding="utf-8")
+            except (TypeError, ValueError):  # no TOML says such a thing
+                continue
+        try:
+            refused(path, inspect_file, how)
+            scenario = refused(path, load_scenario, how)
+            if scenario is not None:
+                field_of_scenario(scenario)
+                assert scenario.to_toml()
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {how}: {error!r}") from error
+
+
+def test_damaged_truths(files, tmp_path):
+    rng = np.random.default_rng(3)
+    result = read_result(files["result"])
+    sound = {
+        "heliostats": [
+            {
+                "id": name,
+                "normal_enu": result.truth.normal_enu[0, i].tolist(),
+                "receivers_enu_m": result.truth.receiver_enu_m[0, result.scenario.receiver_rows(i)].tolist(),
+            }
+            for i, name in enumerate(result.scenario.heliostat_ids)
+        ]
+    }
+    path = tmp_path / "truth.json"
+    path.write_text("\ufeff" + json.dumps(sound), encoding="utf-8")
+    assert evaluate(result, read_truth(path, result.scenario)).solved == 6
+    for k in range(150):
+        data = json.loads(json.dumps(sound))
+        how = damage_values(data, rng)
+        path.write_text(as_json(data))
+        if k % 5 == 0:
+            how = damage_bytes(path, rng)
+        try:
+            found = refused(path, lambda p: read_truth(p, result.scenario), how)
+            if found is not None:
+                with contextlib.suppress(RfposeError):
+                    evaluate(result, found)
+        except Exception as error:
+            raise AssertionError(f"{k}, {how}: {error!r}") from error
+    for text, message in (
+        ('{"heliostats": ' + "[" * 5000, "nested deeper"),
+        ('{"heliostats": [{"id": "H01", "normal_enu": [1e999, 0, 1], "receivers_enu_m": []}]}', "normal_enu"),
+        ('{"heliostats": [{"id": "elsewhere", "normal_enu": [0, 0, 1], "receivers_enu_m": []}]}', "knows none"),
+        ("[1, 2]", "`heliostats` is missing"),
+    ):
+        path.write_text(text)
+        with pytest.raises(RecordingError, match=message):
+            read_truth(path, result.scenario)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a = " + "[" * 100_000, "nested deeper"),
+        ("a." * 5000 + "b = 1", "more than 64 parts"),
+        ("[simulation]\nstart_unix_s = 99999999999999999999999", "64 bits"),
+        ("[simulation]\nstart_unix_s = 999999999999", "start_unix_s"),
+        ("[radio]\nsample_rate_hz = 1e300", "sample_rate_hz"),
+        ("[radio]\nsample_rate_hz = 1e-9", "sample_rate_hz"),
+        ("scale = 1e300", "scale"),
+        ("mirror = 5", "mirror"),
+        ("[mirror]\narm_m = -1", "mirror"),
+        ("[[mirror]]\narm_m = 1", "mirror"),
+    ],
+)
+def test_scenario_texts_that_ask_for_too_much(files, tmp_path, text, message):
+    path = tmp_path / "site.toml"
+    base = files["scenario"].read_text()
+    head, _, tail = text.rpartition("\n")
+    table = f"{head}\n" if head.startswith("[") else ""
+    changed = base.replace(table, f"{text}\n", 1) if table and table in base else f"{text}\n{base}"
+    key = tail.split(" ")[0]
+    lines = [line for line in changed.splitlines() if line == tail or not line.startswith(f"{key} =")]
+    path.write_text("\n".join(lines))
+    with pytest.raises(ScenarioError, match=message) as error:
+        load_scenario(path)
+    assert str(path) in str(error.value)
+
+
+def test_byte_order_marks_and_semicolons(files, tmp_path):
+    site = tmp_path / "bom.toml"
+    site.write_text("\ufeff" + files["scenario"].read_text(), encoding="utf-8")
+    assert load_scenario(site) == small_site()
+    table = tmp_path / "field.csv"
+    table.write_text("\ufeffid;east_m;north_m\nA;1,5;2\n", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"field\.csv: columns are separated by `;`"):
+        read_positions(table)
+    table.write_text("\ufeffid,east_m,north_m\nA,1.5,2\n", encoding="utf-8")
+    assert read_positions(table)[0] == ("A",)
+    wind = Quantity(name="speed", units={"mps": 1.0}, unit="m/s", most=100.0, beyond="any wind")
+    for text, message in (
+        ("unix_s;speed_mps\n0;1\n1;2\n", "separated by `;`"),
+        ("unix_s,speed_mps\n0,1\n1e15,2\n", "from 1970 to 9999"),
+        ("unix_s,speed_mps\n0,1\n200000000000,2\n", "spans 2314815 days"),
+        ('unix_s,speed_mps\n0,"1\n2",3\n', "line 2"),
+        ("unix_s,speed_mps\n0,nan\n1,2\n3,4\n", "must not be negative"),
+    ):
+        table.write_text(text)
+        with pytest.raises(RfposeError, match=message) as error:
+            read_series_csv(table, wind, interval_s=1.0, longest_gap_s=10.0)
+        assert "field.csv" in str(error.value)
