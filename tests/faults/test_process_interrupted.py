@@ -124,8 +124,7 @@ def test_disk_full_leaves_nothing_under_the_name(recording: Path, undisturbed: b
     # journal entries fit below the limit, the result does not
     stopped = _run(recording, result, limit=40_000)
     assert stopped.returncode == 3
-    line = stopped.stderr.splitlines()[0]
-    assert line.startswith(f"rfpose: {result}: cannot write: ")
+    assert f"\nrfpose: {result}: cannot write: " in f"\n{stopped.stderr}"
     assert [path.name for path in tmp_path.iterdir()] == ["result.h5.partial"]
     resumed = _run(recording, result)
     assert int(resumed.stderr.split()[-1]) == 0

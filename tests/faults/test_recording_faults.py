@@ -220,14 +220,18 @@ def test_killed_writer_leaves_the_target_alone(tmp_path, existing):
     assert target.exists() == existing
     if existing:
         assert target.read_text() == "old"
-    left = [p.name for p in tmp_path.iterdir() if p != target]
-    assert left == [f".r.h5.{process.pid}.part"]
+    left = sorted(p.name for p in tmp_path.iterdir() if p != target)
+    assert left == [".r.h5.lock", ".r.h5.part"]
     with pytest.raises(RecordingError):
-        open_recording(tmp_path / left[0])
+        open_recording(tmp_path / ".r.h5.part")
+    # the next one takes them over
+    assert start_writer(target, 1).communicate(timeout=60) == ("0\n", "")
+    assert [p.name for p in tmp_path.iterdir()] == ["r.h5"]
+    open_recording(target).close()
 
 
 def test_no_such_directory(tmp_path):
-    with pytest.raises(RecordingError, match=r"cannot write: No such file or directory; .*directory exists"), \
+    with pytest.raises(RecordingError, match=r"its directory does not exist; make it first: .*no$"), \
             RecordingWriter(
                 tmp_path / "no" / "r.h5", scenario=None, receiver_ids=["a"], sample_rate=Fraction(1),
                 centre_frequency_hz=0.0, sample_format="int16", full_scale=1, provenance={},

@@ -11,9 +11,10 @@ from typing import Any, NoReturn
 
 import click
 
-from rfpose import __version__
+from rfpose import __version__, interruption
 from rfpose.cli._support import Session, emit_json
 from rfpose.errors import RfposeError
+from rfpose.files import release_all
 
 __all__ = ["app"]
 
@@ -49,14 +50,19 @@ class _LazyGroup(click.Group):
         command: click.Command = importlib.import_module(f"rfpose.cli.{cmd_name}").command
         return command
 
+    def make_context(self, *args: Any, **settings: Any) -> click.Context:
+        try:
+            return super().make_context(*args, **settings)
+        except KeyboardInterrupt:  # while the command's module was loaded
+            raise click.exceptions.Exit(EXIT_INTERRUPTED) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         session = ctx.ensure_object(Session)
         try:
-            with _notes_to_stderr():
+            with interruption.heard(), _notes_to_stderr():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            click.echo(f"\nrfpose: {session.when_interrupted}", err=True)
-            ctx.exit(EXIT_INTERRUPTED)
+            _leave(ctx, session.when_interrupted)
         except RfposeError as error:
             _fail(ctx, session, str(error), EXIT_BAD_DATA)
         except (BrokenPipeError, click.ClickException, click.exceptions.Exit, click.Abort):
@@ -88,6 +94,15 @@ def _notes_to_stderr() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
+
+
+def _leave(ctx: click.Context, message: str) -> NoReturn:
+    """End after an interruption; another one, or a terminal that is gone, changes nothing any more."""
+    with interruption.ignored():
+        release_all()
+        with contextlib.suppress(OSError):
+            click.echo(f"\nrfpose: {message}", err=True)
+        ctx.exit(EXIT_INTERRUPTED)
 
 
 def _fail(ctx: click.Context, session: Session, message: str, code: int) -> NoReturn:

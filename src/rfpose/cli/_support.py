@@ -6,24 +6,33 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
 
 import click
+
+from rfpose.errors import InvalidInputError
+from rfpose.files import claim
 
 __all__ = [
     "Progress",
     "Session",
+    "check_ending",
     "common_options",
     "emit_json",
     "examples",
     "follow_links_option",
     "force_option",
+    "outputs",
     "progress",
     "say",
     "table",
     "wants_json",
+    "when_written",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -114,10 +123,49 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> N
 
 
 @contextlib.contextmanager
+def outputs(
+    *paths: Path | None, inputs: Iterable[Path | None] = (), force: bool = False, directories: bool = False
+) -> Iterator[None]:
+    """Check what a command will write before it loads or does anything; publish it when the block ends well.
+
+    See `rfpose.files.claim`.
+    """
+    with claim(*paths, inputs=inputs, force=force, directories=directories):
+        yield
+    written = [path for path in paths if path is not None]
+    if written:
+        click.get_current_context().ensure_object(Session).when_interrupted = when_written(*written)
+
+
+def when_written(*paths: Path) -> str:
+    """Return what to say of an interruption that comes too late to prevent anything."""
+    return f"interrupted when all was done: {', '.join(map(str, paths))} written"
+
+
+def check_ending(path: Path | None, *endings: str) -> None:
+    """Refuse a name with another ending before any work is done for it."""
+    if path is not None and path.suffix not in endings:
+        raise InvalidInputError(f"{path}: its name must end in {', '.join(endings)}")
+
+
+_EVERY_S = 10.0
+"""From one line of progress to the next, where no bar can be drawn [s]."""
+
+
+@contextlib.contextmanager
 def progress(text: str) -> Iterator[Progress]:
-    """Give a callback that draws a bar on standard error if that is a terminal."""
+    """Give a callback that draws a bar on standard error if that is a terminal, else writes a line now and then."""
     if not sys.stderr.isatty():
-        yield Progress(None)
+        shown = _Lines(text)
+        ended = threading.Event()
+        # a thread, so that work that reports nothing is heard of too
+        teller = threading.Thread(target=shown.tell_until, args=(ended,), name="rfpose-progress", daemon=True)
+        teller.start()
+        try:
+            yield shown
+        finally:
+            ended.set()
+            teller.join()
         return
     from rich.console import Console
     from rich.progress import Progress as Bar
@@ -126,24 +174,66 @@ def progress(text: str) -> Iterator[Progress]:
     default = Bar.get_default_columns()[:-1]
     columns = (*default, TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        shown = Progress(bar)
-        shown.stage(text)
-        yield shown
+        drawn = _Drawn(bar)
+        drawn.stage(text)
+        yield drawn
 
 
-class Progress:
-    """Called with (done, total) of a stage; draws nothing without a bar."""
+class Progress(Protocol):
+    """Called with (done, total) of a stage."""
+
+    def stage(self, text: str) -> None:
+        """Begin another stage."""
+
+    def __call__(self, done: int, total: int) -> None:
+        """Take note of how far the stage is."""
+
+
+class _Drawn:
+    """A bar for each stage."""
 
     def __init__(self, bar: Any) -> None:
         self._bar = bar
         self._task: Any = None
 
     def stage(self, text: str) -> None:
-        """Begin another stage, with a bar of its own."""
-        if self._bar is not None:
-            self._task = self._bar.add_task(text, total=None)
+        self._task = self._bar.add_task(text, total=None)
 
     def __call__(self, done: int, total: int) -> None:
-        """Move the bar."""
-        if self._bar is not None:
-            self._bar.update(self._task, completed=done, total=total)
+        self._bar.update(self._task, completed=done, total=total)
+
+
+class _Lines:
+    """A line every `_EVERY_S`; nothing of what is over sooner."""
+
+    def __init__(self, text: str) -> None:
+        self.stage(text)
+
+    def stage(self, text: str) -> None:
+        now = time.monotonic()
+        # one tuple, which the other thread sees as a whole
+        self._state = (text, now, 0, 0, now)
+
+    def __call__(self, done: int, total: int) -> None:
+        text, began, *_ = self._state
+        self._state = (text, began, done, total, time.monotonic())
+
+    def tell_until(self, ended: threading.Event) -> None:
+        """Write lines until the work has ended."""
+        while not ended.wait(_EVERY_S):
+            with contextlib.suppress(OSError):  # nobody reads
+                click.echo(f"rfpose: {self.line()}", err=True)
+
+    def line(self) -> str:
+        """Return how far the stage is and how long it will still take."""
+        text, began, done, total, at = self._state
+        if not done:
+            return f"{text}, for {_duration(time.monotonic() - began)}"
+        left = max(0.0, (at - began) * (total / done - 1.0) - (time.monotonic() - at))
+        return f"{text}: {done} of {total}, {_duration(left)} left"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"

@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, say, table, wants_json
+from rfpose.cli._support import (
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    outputs,
+    progress,
+    say,
+    table,
+    wants_json,
+)
 
 if TYPE_CHECKING:
     from rfpose.pipeline.aim import Plan
@@ -59,11 +69,37 @@ def command(
     """
     if dish == (target is not None):
         raise click.UsageError("give either --target E N U, or --dish")
+    with outputs(output, inputs=[model], force=force), progress("Aiming"):
+        plans = _plans(model, target, start, hours, step, heliostats, site, n_next)
+        if output is not None:
+            from rfpose.pipeline.aim import write_commands
+
+            write_commands(output, plans, force=force)
+    if wants_json():
+        emit_json({"heliostats": [plan.as_dict() for plan in plans]})
+        return
+    for plan in plans:
+        _show(plan)
+    if output is not None:
+        say(f"wrote {output}")
+
+
+def _plans(
+    model: Path,
+    target: tuple[float, float, float] | None,
+    start: str,
+    hours: float,
+    step: float,
+    heliostats: tuple[str, ...],
+    site: tuple[float, float, float] | None,
+    n_next: int,
+) -> tuple[Plan, ...]:
+    """Plan what the options name."""
     from rfpose.feedback.sun import site_from_degrees
-    from rfpose.pipeline.aim import plan_commands, write_commands
+    from rfpose.pipeline.aim import plan_commands
 
     place = None if site is None else site_from_degrees(*site)
-    plans = plan_commands(
+    return plan_commands(
         model,
         target_enu_m=target,
         start=start,
@@ -73,15 +109,6 @@ def command(
         site=place,
         n_next=n_next,
     )
-    if output is not None:
-        write_commands(output, plans, force=force)
-    if wants_json():
-        emit_json({"heliostats": [plan.as_dict() for plan in plans]})
-        return
-    for plan in plans:
-        _show(plan)
-    if output is not None:
-        say(f"wrote {output}")
 
 
 def _show(plan: Plan) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, table, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, progress, table, wants_json
 
 __all__ = ["command"]
 
@@ -23,9 +23,10 @@ __all__ = ["command"]
 @common_options
 def command(seconds: float) -> None:
     """Measure the speed of signal processing and multilateration on this machine."""
-    from rfpose.pipeline.bench import run
+    with progress("Measuring"):
+        from rfpose.pipeline.bench import run
 
-    measured = run(seconds=seconds)
+        measured = run(seconds=seconds)
     if wants_json():
         emit_json(measured)
         return

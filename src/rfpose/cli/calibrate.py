@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, say, table, wants_json
+from rfpose.cli._support import (
+    check_ending,
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    outputs,
+    progress,
+    say,
+    table,
+    wants_json,
+)
 
 if TYPE_CHECKING:
     from rfpose.pipeline.calibrate import Calibrations
@@ -81,19 +92,19 @@ def command(
     if bool(radio) != (motors is not None):
         raise click.UsageError("--radio and --motors belong together: a pose alone does not say what the motors did")
 
-    from rfpose.feedback.mount import PARAMETERS
-    from rfpose.pipeline.calibrate import draw_errors, write_models
-    from rfpose.pipeline.files import refuse_existing
+    check_ending(output, ".json", ".toml")
+    check_ending(picture, ".png", ".pdf", ".svg")
+    inputs = [directory, mounts, *radio, motors, camera, drone]
+    with outputs(output, picture, inputs=inputs, force=force), progress("Fitting"):
+        from rfpose.feedback.mount import PARAMETERS
+        from rfpose.pipeline.calibrate import draw_errors, write_models
 
-    for path in (output, picture):
-        if path is not None:
-            refuse_existing(path, force=force or path == picture)
-    free = tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters
-    reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free, algorithm)
-    if output is not None:
-        write_models(output, reports, settings={"parameters": parameters}, force=force)
-    if picture is not None:
-        draw_errors(picture, reports)
+        free = tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters
+        reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free, algorithm)
+        if output is not None:
+            write_models(output, reports, settings={"parameters": parameters}, force=force)
+        if picture is not None:
+            draw_errors(picture, reports)
     if wants_json():
         emit_json(
             {

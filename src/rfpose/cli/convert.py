@@ -13,6 +13,7 @@ from rfpose.cli._support import (
     examples,
     follow_links_option,
     force_option,
+    outputs,
     progress,
     say,
     wants_json,
@@ -44,16 +45,16 @@ def command(
     recording: Path, output: Path, format_name: Any, scenario: Path | None, follow_links: bool, force: bool
 ) -> None:
     """Write a recording in another format; samples, times and gaps stay exactly as they are."""
-    from rfpose.recording import convert, open_recording
-    from rfpose.scenario import load_scenario
+    directories = format_name != FORMAT_NAMES[0]
+    claimed = outputs(output, inputs=[recording, scenario], force=force, directories=directories)
+    with claimed, progress("Converting") as on_progress:
+        from rfpose.recording import convert, open_recording
+        from rfpose.scenario import load_scenario
 
-    given = None if scenario is None else load_scenario(scenario)
-    with (
-        open_recording(recording, scenario=given, follow_links=follow_links) as source,
-        progress("Converting") as on_progress,
-    ):
-        convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
-        found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
+        given = None if scenario is None else load_scenario(scenario)
+        with open_recording(recording, scenario=given, follow_links=follow_links) as source:
+            convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
+            found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
     if wants_json():
         emit_json(found)
     else:

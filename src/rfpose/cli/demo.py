@@ -6,7 +6,17 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
+from rfpose.cli._support import (
+    Session,
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    progress,
+    say,
+    wants_json,
+    when_written,
+)
 from rfpose.cli.evaluate import show_evaluation
 from rfpose.errors import RfposeError
 
@@ -25,18 +35,15 @@ __all__ = ["command", "write_report"]
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Same seed, same recording.")
 @force_option
 @common_options
-def command(output: Path, seed: int, force: bool) -> None:
+@click.pass_obj
+def command(session: Session, output: Path, seed: int, force: bool) -> None:
     """Simulate a field of 12 heliostats, process the recording, evaluate it, draw it and write a report."""
     from rfpose.pipeline.demo import run_demo
-    from rfpose.pipeline.files import refuse_existing
 
-    report = output / "report.html"
-    if output.is_dir():
-        refuse_existing(report, force=force)
     with progress("Preparing") as shown:
-        outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage)
-        shown.stage("Writing the report")
-        files = outcome.files | write_report(Path(outcome.files["result"]), report)
+        outcome = run_demo(output, seed=seed, force=force, on_progress=shown, on_stage=shown.stage, report=write_report)
+    files = outcome.files
+    session.when_interrupted = when_written(*files.values())
     if wants_json():
         emit_json(
             {

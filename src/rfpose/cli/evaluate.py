@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, say, table, wants_json
+from rfpose.cli._support import (
+    common_options,
+    emit_json,
+    examples,
+    follow_links_option,
+    progress,
+    say,
+    table,
+    wants_json,
+)
 
 if TYPE_CHECKING:
     from rfpose.pipeline.evaluate import Evaluation, Statistics
@@ -34,15 +43,18 @@ def command(result: Path, truth: Path | None, follow_links: bool) -> None:
     Errors are of the mirror normal; the beam's are twice that.
     """
     from rfpose.errors import RecordingError
-    from rfpose.pipeline.evaluate import evaluate, read_truth
-    from rfpose.pipeline.result_file import read_result
 
-    found = read_result(result)
-    if truth is None and found.truth is None:
-        raise RecordingError(f"{result}: carries no truth; add --truth FILE (a simulated recording or JSON)")
-    evaluation = evaluate(
-        found, None if truth is None else read_truth(truth, found.scenario, follow_links=follow_links)
-    )
+    with progress("Evaluating"):
+        from rfpose.pipeline.result_file import read_result
+
+        found = read_result(result)
+        if truth is None and found.truth is None:
+            raise RecordingError(f"{result}: carries no truth; add --truth FILE (a simulated recording or JSON)")
+        from rfpose.pipeline.evaluate import evaluate, read_truth
+
+        evaluation = evaluate(
+            found, None if truth is None else read_truth(truth, found.scenario, follow_links=follow_links)
+        )
     if wants_json():
         emit_json(evaluation.as_dict())
         return

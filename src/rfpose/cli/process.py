@@ -14,6 +14,7 @@ from rfpose.cli._support import (
     examples,
     follow_links_option,
     force_option,
+    outputs,
     progress,
     say,
     table,
@@ -100,14 +101,11 @@ def command(
 
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
-    from rfpose.pipeline.files import refuse_existing
-    from rfpose.pipeline.process import process
-    from rfpose.pipeline.result_summary import summarise, write_poses_csv
-
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    if csv_path is not None:
-        refuse_existing(csv_path, force=force)
-    with progress("Measuring") as on_progress:
+    claimed = outputs(output, csv_path, inputs=[recording, scenario], force=force)
+    with claimed, progress("Measuring") as on_progress:
+        from rfpose.pipeline.process import process
+
         result = process(
             recording,
             output,
@@ -121,9 +119,11 @@ def command(
             force=force,
             on_progress=on_progress,
         )
-    if csv_path is not None:
-        write_poses_csv(result, csv_path)
-    summary = summarise(result)
+        from rfpose.pipeline.result_summary import summarise, write_poses_csv
+
+        if csv_path is not None:
+            write_poses_csv(result, csv_path)
+        summary = summarise(result)
     if wants_json():
         emit_json({"result": output, "csv": csv_path, **summary})
         return

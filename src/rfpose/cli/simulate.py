@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, progress, say, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, force_option, outputs, progress, say, wants_json
 
 __all__ = ["command"]
 
@@ -28,9 +28,9 @@ def command(scenario: Path, output: Path, seed: int, force: bool) -> None:
 
     SCENARIO is a TOML file; its [simulation] table says how many frames, how much noise and which impairments.
     """
-    from rfpose.pipeline.simulate import simulate_recording
+    with outputs(output, inputs=[scenario], force=force), progress("Simulating") as on_progress:
+        from rfpose.pipeline.simulate import simulate_recording
 
-    with progress("Simulating") as on_progress:
         summary = simulate_recording(scenario, output, seed=seed, force=force, on_progress=on_progress)
     if wants_json():
         emit_json(summary)

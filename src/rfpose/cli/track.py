@@ -9,10 +9,12 @@ import click
 
 from rfpose.cli._support import (
     Session,
+    check_ending,
     common_options,
     emit_json,
     examples,
     force_option,
+    outputs,
     progress,
     say,
     table,
@@ -97,15 +99,13 @@ def command(
     Interrupted or killed, the same command goes on where it stopped; the result is the same. Milliradians are of the
     mirror normal; the beam turns by twice as much.
     """
-    from rfpose.pipeline.files import refuse_existing
-    from rfpose.pipeline.track import track
-    from rfpose.pipeline.track_file import write_track_csv
-
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    for path in (csv_path, picture):
-        if path is not None:
-            refuse_existing(path, force=force)
-    with progress("Tracking") as on_progress:
+    check_ending(picture, ".png", ".svg")
+    happenings = [_event(text) for text in events]
+    claimed = outputs(output, csv_path, picture, inputs=[scenario], force=force)
+    with claimed, progress("Tracking") as on_progress:
+        from rfpose.pipeline.track import track
+
         found = track(
             scenario,
             output,
@@ -114,20 +114,22 @@ def command(
             day_interval=day_interval,
             heliostats=heliostats,
             sky=sky,
-            events=[_event(text) for text in events],
+            events=happenings,
             without_field_control=without_field_control,
             check_iq=tuple(name.strip() for name in check_iq.split(",")) if check_iq else (),
             seed=seed,
             force=force,
             on_progress=on_progress,
         )
-    if csv_path is not None:
-        write_track_csv(found, csv_path)
-    if picture is not None:
-        from rfpose.pipeline.track_pictures import draw_track
+        if csv_path is not None:
+            from rfpose.pipeline.track_file import write_track_csv
 
-        draw_track(found, picture)
-    summary = found.as_dict()
+            write_track_csv(found, csv_path)
+        if picture is not None:
+            from rfpose.pipeline.track_pictures import draw_track
+
+            draw_track(found, picture)
+        summary = found.as_dict()
     if wants_json():
         emit_json({"result": output, "csv": csv_path, "picture": picture, **summary})
         return

@@ -6,7 +6,18 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, force_option, say, wants_json
+from rfpose.cli._support import (
+    check_ending,
+    common_options,
+    emit_json,
+    examples,
+    follow_links_option,
+    force_option,
+    outputs,
+    progress,
+    say,
+    wants_json,
+)
 
 __all__ = ["command"]
 
@@ -62,24 +73,24 @@ def command(
         return
     if file is None:
         raise click.UsageError("--save needs a FILE to draw")
-    from rfpose.pipeline.files import refuse_existing
-    from rfpose.viewer.app import check_installed
-    from rfpose.viewer.export import export
+    check_ending(save, ".png", ".svg", ".html")
+    with outputs(save, inputs=[file, scenario], force=force), progress("Drawing"):
+        from rfpose.viewer.app import check_installed
+        from rfpose.viewer.export import export
 
-    check_installed()
-    refuse_existing(save, force=force)
-    shown = export(
-        file,
-        save,
-        view=view,
-        scenario_path=scenario,
-        follow_links=follow_links,
-        theme=theme or THEMES[0],
-        size=size,
-        heliostat=heliostat,
-        transmitter=transmitter,
-        frame=frame,
-    )
+        check_installed()
+        shown = export(
+            file,
+            save,
+            view=view,
+            scenario_path=scenario,
+            follow_links=follow_links,
+            theme=theme or THEMES[0],
+            size=size,
+            heliostat=heliostat,
+            transmitter=transmitter,
+            frame=frame,
+        )
     if wants_json():
         emit_json({"file": file, "saved": save, "view": shown})
     else:

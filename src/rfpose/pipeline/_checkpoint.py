@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.errors import RecordingError
-from rfpose.pipeline.files import write_atomically
+from rfpose.files import replace_content
 
 __all__ = ["Checkpoint"]
 
@@ -76,7 +76,7 @@ class Checkpoint:
             return
         buffer = io.BytesIO()
         np.savez(buffer, **{**state, _KEY: np.array(json.dumps(self._key, sort_keys=True))})  # type: ignore[arg-type]
-        write_atomically(self._path, buffer.getvalue())
+        replace_content(self._path, buffer.getvalue())
         self._last = time.monotonic()
 
     def remove(self) -> None:

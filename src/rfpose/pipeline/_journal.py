@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.errors import RecordingError
-from rfpose.pipeline.files import TEMPORARY_SUFFIX, make_directory, write_atomically
+from rfpose.files import make_directory, replace_content
 
 __all__ = ["Entry", "Journal"]
 
@@ -63,7 +63,7 @@ class Journal:
         elif not resume:
             self.remove()
         make_directory(directory)
-        write_atomically(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())
+        replace_content(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())
 
     def _read_key(self) -> dict[str, str] | None:
         try:
@@ -81,7 +81,7 @@ class Journal:
 
     @staticmethod
     def _is_own(path: Path) -> bool:
-        return path.name == _KEY_NAME or path.suffix == TEMPORARY_SUFFIX or _ENTRY_NAME.fullmatch(path.name) is not None
+        return path.name == _KEY_NAME or path.suffix == ".part" or _ENTRY_NAME.fullmatch(path.name) is not None
 
     def read(self) -> list[tuple[int, int, Entry]]:
         """Return ``(first row, end row, arrays)`` of the entries from row zero on; what follows a damaged one is lost.
@@ -108,7 +108,7 @@ class Journal:
         """Write one entry; it is there in whole or not at all."""
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
-        write_atomically(self._directory / f"rows-{first_row:012d}-{end_row:012d}.npz", buffer.getvalue())
+        replace_content(self._directory / f"rows-{first_row:012d}-{end_row:012d}.npz", buffer.getvalue())
 
     def remove(self) -> None:
         """Delete the entries and, unless something else is in it, the directory."""

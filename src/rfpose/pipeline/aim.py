@@ -18,7 +18,7 @@ from rfpose.feedback.design import Forecast, forecast, next_postures
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus
 from rfpose.feedback.sun import Site, unix_seconds
-from rfpose.pipeline.files import refuse_existing, write_atomically
+from rfpose.files import claim
 from rfpose.pipeline.mount_file import StoredMount, read_models
 
 __all__ = ["Plan", "plan_commands", "write_commands"]
@@ -218,14 +218,14 @@ def write_commands(path: Path, plans: Sequence[Plan], *, force: bool = False) ->
     RecordingError
         The file exists and ``force`` is not set, or cannot be written.
     """
-    refuse_existing(path, force=force)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for plan in plans:
         for row in _rows(plan):
             writer.writerow(["" if isinstance(value, float) and np.isnan(value) else value for value in row])
-    write_atomically(path, text.getvalue().encode())
+    with claim(path, force=force) as job:
+        job.write(path, text.getvalue().encode())
 
 
 def _rows(plan: Plan) -> list[list[Any]]:

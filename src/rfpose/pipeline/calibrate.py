@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from rfpose.feedback.paint import PaintHeliostat, heliostat_ids, read_heliostat
 from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
 from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
+from rfpose.files import write_atomically
 from rfpose.pipeline.calibration_sources import Gathered
 from rfpose.pipeline.mount_file import MountFile, write_model_file
 
@@ -451,4 +453,6 @@ def draw_errors(path: Path, reports: Sequence[HeliostatReport]) -> None:
         axes.set_ylabel("normal error [mrad]")
         axes.set_title(f"{report.id}: grey = held-out median, red = shift", fontsize=9, loc="left")
     axes.set_xlabel("record, in the order of time")
-    figure.savefig(path, dpi=120)
+    image = io.BytesIO()
+    figure.savefig(image, format=path.suffix[1:], dpi=120)
+    write_atomically(path, image.getvalue())

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rfpose.errors import RecordingError
-from rfpose.pipeline.evaluate import Evaluation, evaluate
-from rfpose.pipeline.files import make_directory, refuse_existing
-from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
-from rfpose.pipeline.process import process
-from rfpose.pipeline.result_summary import write_poses_csv
-from rfpose.pipeline.simulate import simulate_recording
-from rfpose.pipeline.solve import solve
-from rfpose.recording import open_recording
+from rfpose.files import claim, make_directory, remove
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.evaluate import Evaluation
 
 __all__ = ["STAGES", "DemoOutcome", "run_demo", "shipped_scenario"]
 
-STAGES = ("Simulating", "Measuring", "Drawing")
+STAGES = ("Simulating", "Measuring", "Drawing", "Writing the report")
 
 _FILES = {
     "recording": "recording.h5",
@@ -28,6 +26,8 @@ _FILES = {
     "field_map": "field_map.png",
     "spectrum": "spectrum.png",
 }
+_REPORT = "report.html"
+_SCRATCH = ".demo.part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +58,7 @@ def run_demo(
     on_progress: Callable[[int, int], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
     scenario_path: str | Path | None = None,
+    report: Callable[[Path, Path], object] | None = None,
 ) -> DemoOutcome:
     """Simulate 12 heliostats on Table 2's layout, process the recording, evaluate the result and draw it.
 
@@ -72,26 +73,68 @@ def run_demo(
     on_progress
         Called with (done, total) of the running stage.
     on_stage
-        Called with the name of each stage, one of `STAGES`, as it begins.
+        Called with the name of each stage, one of `STAGES`, as it begins; the last only with ``report``.
     scenario_path
         Another site than the shipped one.
+    report
+        Called with the result and the name of a report to write; it may leave that out.
 
     Raises
     ------
     RecordingError
         Files are there already, or cannot be written.
     """
-    directory = make_directory(directory)
-    files = {what: directory / name for what, name in _FILES.items()}
-    for path in files.values():
-        refuse_existing(path, force=force)
-    tell = on_stage or (lambda _text: None)
-
-    tell(STAGES[0])
     scenario_path = scenario_path or shipped_scenario("table2_100m.toml")
-    simulate_recording(scenario_path, files["recording"], seed=seed, force=force, on_progress=on_progress)
+    names = _FILES if report is None else {**_FILES, "report": _REPORT}
+    is_new = not Path(directory).exists()
+    directory = make_directory(directory)
+    files = {what: directory / name for what, name in names.items()}
+    # each stage reads what the one before wrote: all stay aside until the last is done
+    scratch = directory / _SCRATCH
+    try:
+        with claim(*files.values(), inputs=[scenario_path], force=force) as job:
+            try:
+                remove(scratch)
+                scratch.mkdir()
+                tell = on_stage or (lambda _text: None)
+                evaluations = _run(scratch, scenario_path, seed, on_progress, tell)
+                if report is not None:
+                    tell(STAGES[3])
+                    report(scratch / _FILES["result"], scratch / _REPORT)
+                made = {what: path for what, path in files.items() if (scratch / path.name).exists()}
+                for path in made.values():
+                    (scratch / path.name).replace(job.part(path))
+                    job.complete(path)
+            finally:
+                remove(scratch)
+    finally:
+        if is_new:
+            with contextlib.suppress(OSError):  # it is not empty: all is well
+                directory.rmdir()
+    return DemoOutcome(evaluation=evaluations[0], independent=evaluations[1], files=made)
+
+
+def _run(
+    place: Path,
+    scenario_path: str | Path,
+    seed: int,
+    on_progress: Callable[[int, int], None] | None,
+    tell: Callable[[str], None],
+) -> tuple[Evaluation, Evaluation]:
+    """Make all but the report; return the evaluations of all phases at once and of each receiver alone."""
+    from rfpose.pipeline.evaluate import evaluate
+    from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
+    from rfpose.pipeline.process import process
+    from rfpose.pipeline.result_summary import write_poses_csv
+    from rfpose.pipeline.simulate import simulate_recording
+    from rfpose.pipeline.solve import solve
+    from rfpose.recording import open_recording
+
+    files = {what: place / name for what, name in _FILES.items()}
+    tell(STAGES[0])
+    simulate_recording(scenario_path, files["recording"], seed=seed, on_progress=on_progress)
     tell(STAGES[1])
-    result = process(files["recording"], files["result"], force=force, on_progress=on_progress)
+    result = process(files["recording"], files["result"], on_progress=on_progress)
     tell(STAGES[2])
     evaluation = evaluate(result)
     settings = {**result.settings, "pose": "independent"}
@@ -100,4 +143,4 @@ def run_demo(
     draw_field_map(result, files["field_map"], evaluation=evaluation)
     with open_recording(files["recording"]) as recording:
         draw_spectrum(recording, files["spectrum"])
-    return DemoOutcome(evaluation=evaluation, independent=independent, files=files)
+    return evaluation, independent

@@ -22,9 +22,9 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.calibrated import Choice, Known, resolve_free
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.feedback.sun import Site, site_from_degrees
+from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
 from rfpose.kinds import kind_of
-from rfpose.pipeline.files import refuse_existing, write_atomically
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "is_model", "read_models", "write_model_file"]
 
@@ -132,7 +132,6 @@ def write_model_file(
     path = Path(path)
     if path.suffix not in (".json", ".toml"):
         raise RecordingError(f"{path}: a model is written as .json or .toml; change the name's ending")
-    refuse_existing(path, force=force)
     groups = undetermined or {}
     content: dict[str, Any] = {
         "format": MODEL_FORMAT,
@@ -147,7 +146,8 @@ def write_model_file(
         }
     content["heliostat"] = {name: _as_table(known, groups.get(name, ())) for name, known in heliostats.items()}
     text = tomli_w.dumps(content) if path.suffix == ".toml" else json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_atomically(path, text.encode())
+    with claim(path, force=force) as job:
+        job.write(path, text.encode())
 
 
 def _as_table(known: Known, undetermined: tuple[tuple[str, ...], ...]) -> dict[str, Any]:

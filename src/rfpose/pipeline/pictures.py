@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
+from rfpose.files import write_atomically
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.evaluate import Evaluation
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.result import Result
 from rfpose.recording import Recording, frame_starts
 from rfpose.scenario import Scenario

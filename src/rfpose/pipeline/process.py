@@ -5,24 +5,22 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose import __version__
-from rfpose.dsp import ESTIMATORS
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.files import claim
 from rfpose.pipeline._journal import Journal
-from rfpose.pipeline.choice import PoseChoice, choose
-from rfpose.pipeline.files import refuse_existing
-from rfpose.pipeline.measure import journal_key, measure_tones
-from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import write_result
-from rfpose.pipeline.solve import check_solvable, solve
-from rfpose.pipeline.truth_rows import align_truth
 from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
+from rfpose.recording.members import members
 from rfpose.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.choice import PoseChoice
+    from rfpose.pipeline.result import Result
 
 __all__ = ["process"]
 
@@ -79,7 +77,7 @@ def process(
     Raises
     ------
     RecordingError
-        A file that is missing, damaged, exists already or cannot be written.
+        A file that is missing, damaged, exists already, is both read and to be written, or cannot be written.
     ScenarioError
         No scenario, or one that disagrees with the recording or cannot be solved.
     GeometryError
@@ -88,34 +86,42 @@ def process(
         Unknown ``estimator``, ``pose`` or ``reflection``, or a choice that the pose cannot follow.
     """
     recording_path, result_path = Path(recording_path), Path(result_path)
-    if estimator not in ESTIMATORS:
-        raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-    refuse_existing(result_path, force=force)
-    given = None if scenario_path is None else load_scenario(scenario_path)
-    with open_recording(recording_path, follow_links=follow_links) as recording:
-        scenario = _choose_scenario(recording, given)
-        check_against(recording, scenario)
-        choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
-        check_solvable(scenario, pose=pose, choice=choice)
-        _note_differing_receivers(recording, scenario)
-        note_doubts(recording)
-        starts = _frames(recording, scenario)
-        journal = Journal(
-            result_path.with_name(f"{result_path.name}.partial"),
-            journal_key(recording, scenario, estimator),
-            restart=force,
-            resume=resume,
-        )
-        tones = measure_tones(
-            recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
-        )
-        asked = {"reflection": reflection, "integrity": integrity, "filter": filtered}
-        settings = _settings(recording, scenario, choice, estimator=estimator, asked=asked, scenario_path=scenario_path)
-        truth = None if recording.truth is None else align_truth(recording.truth, scenario)
-    result = solve(tones, scenario, settings=settings, truth=truth)
-    write_result(result, result_path)
-    journal.remove()
-    return result
+    kept = result_path.with_name(f"{result_path.name}.partial")
+    inputs = [recording_path, *members(recording_path), scenario_path, kept]
+    with claim(result_path, inputs=inputs, force=force) as job:
+        given = None if scenario_path is None else load_scenario(scenario_path)
+        with open_recording(recording_path, follow_links=follow_links) as recording:
+            scenario = _choose_scenario(recording, given)
+            check_against(recording, scenario)
+            starts = _frames(recording, scenario)
+            # compiled code, which none of the refusals above should wait for
+            from rfpose.dsp import ESTIMATORS
+            from rfpose.pipeline.choice import choose
+            from rfpose.pipeline.measure import journal_key, measure_tones
+            from rfpose.pipeline.result_file import write_result
+            from rfpose.pipeline.solve import check_solvable, solve
+            from rfpose.pipeline.truth_rows import align_truth
+
+            if estimator not in ESTIMATORS:
+                raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+            choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
+            check_solvable(scenario, pose=pose, choice=choice)
+            _note_differing_receivers(recording, scenario)
+            note_doubts(recording)
+            key = journal_key(recording, scenario, estimator)
+            journal = Journal(kept, key, restart=force, resume=resume)
+            tones = measure_tones(
+                recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
+            )
+            asked = {"reflection": reflection, "integrity": integrity, "filter": filtered}
+            settings = _settings(
+                recording, scenario, choice, estimator=estimator, asked=asked, scenario_path=scenario_path
+            )
+            truth = None if recording.truth is None else align_truth(recording.truth, scenario)
+        result = solve(tones, scenario, settings=settings, truth=truth)
+        write_result(result, result_path)
+        job.afterwards(journal.remove)
+        return result
 
 
 def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:
@@ -174,6 +180,8 @@ def _settings(
         command += " --integrity" if asked["integrity"] else " --no-integrity"
     if asked["filter"] is not None:
         command += " --filter" if asked["filter"] else " --no-filter"
+    from rfpose.pipeline.mirrors import mirror_groups
+
     learns = choice.pose == "rigid" and any(group.learns_delays for group in mirror_groups(scenario))
     return {
         "version": __version__,

@@ -20,12 +20,12 @@ import numpy.typing as npt
 from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.files import write_atomically
 from rfpose.kinds import told_kind
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
 from rfpose.pipeline.result import (
     LAST_TIME_S,

@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import LineStatus
+from rfpose.files import write_atomically
 from rfpose.multilat import FixStatus, PoseStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.result import (
     DelayTable,
     FilteredTable,

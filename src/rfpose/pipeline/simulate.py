@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from rfpose import __version__
-from rfpose.pipeline.files import refuse_existing
+from rfpose.files import claim
 from rfpose.recording import RecordingWriter
-from rfpose.scenario import load_scenario
-from rfpose.simulate import Simulator
+from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["simulate_recording"]
 
@@ -49,11 +48,18 @@ def simulate_recording(
     ScenarioError
         The scenario is malformed or cannot be simulated.
     RecordingError
-        The file exists already or cannot be written; nothing is left under its name.
+        The file exists already, is the scenario, or cannot be written; nothing is left under its name.
     """
     recording_path = Path(recording_path)
-    refuse_existing(recording_path, force=force)
-    scenario = load_scenario(scenario_path)
+    with claim(recording_path, inputs=[scenario_path], force=force):
+        return _simulate(load_scenario(scenario_path), recording_path, seed=seed, on_progress=on_progress)
+
+
+def _simulate(
+    scenario: Scenario, recording_path: Path, *, seed: int, on_progress: Callable[[int, int], None] | None
+) -> dict[str, Any]:
+    from rfpose.simulate import Simulator  # compiled code, which no refusal should wait for
+
     simulator = Simulator(scenario, seed=seed)
     writer = RecordingWriter(
         recording_path,
@@ -64,7 +70,6 @@ def simulate_recording(
         sample_format=simulator.sample_format,
         full_scale=simulator.full_scale,
         provenance={"made_by": f"rfpose simulate {__version__}", "seed": str(seed)},
-        overwrite=force,
     )
     done = 0
     with writer:
@@ -82,5 +87,5 @@ def simulate_recording(
         "frame_samples": scenario.radio.frame_samples,
         "receivers": len(simulator.receiver_ids),
         "samples": done,
-        "bytes": recording_path.stat().st_size,
+        "bytes": writer.n_byte,
     }

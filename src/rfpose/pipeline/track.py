@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rfpose import __version__
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
-from rfpose.feedback.tracking import Simulation
+from rfpose.files import claim
 from rfpose.pipeline._checkpoint import Checkpoint
-from rfpose.pipeline.files import refuse_existing
-from rfpose.pipeline.track_file import Track, track_of, write_track
-from rfpose.pipeline.track_iq import check_with_iq
 from rfpose.scenario import Scenario, check_scenario, load_scenario
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.track_file import Track
 
 __all__ = ["track"]
 
@@ -73,46 +74,60 @@ def track(
     ScenarioError
         The scenario is malformed or cannot be tracked; the message begins with the file.
     RecordingError
-        The file exists already or cannot be written; unfinished work of another job is in the way.
+        The file exists already, is one that is read, or cannot be written; unfinished work of another job is in the
+        way.
     """
     result_path = Path(result_path)
-    refuse_existing(result_path, force=force)
-    base = load_scenario(scenario_path)
+    place = result_path.with_name(f".{result_path.name}.state")
+    with claim(result_path, inputs=[scenario_path, place], force=force) as job:
+        base = load_scenario(scenario_path)
+        changed = {"days": days, "day_interval": day_interval, "sky": sky}
+        with _naming(scenario_path):
+            scenario = _with(base, events, without_field_control, changed)
+        records = {"wind": scenario.tracking.wind.record, "beam": scenario.tracking.beam_record}
+        with claim(inputs=records.values()):  # none of the outputs may be one of them
+            pass
+        # compiled code, which none of the refusals above should wait for
+        from rfpose.feedback.tracking import Simulation
+        from rfpose.pipeline.track_file import track_of, write_track
+        from rfpose.pipeline.track_iq import check_with_iq
+
+        with _naming(scenario_path):
+            simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
+        settings = {
+            "version": __version__,
+            "seed": str(seed),
+            "methods": " ".join(m.name for m in simulation.methods),
+            "heliostats": str(len(simulation.field)),
+        }
+        key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
+        for name, path in records.items():
+            if path is not None:
+                key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
+        state = checkpoint.read()
+        with _naming(scenario_path):
+            iq = check_with_iq(scenario, check_iq, seed=seed)
+        if state is not None:
+            simulation.restore(state)
+        while simulation.done < simulation.n_segment:
+            simulation.advance()
+            checkpoint.write(simulation.state())
+            if on_progress is not None:
+                on_progress(simulation.done, simulation.n_segment)
+        found = track_of(simulation, settings, iq=iq)
+        write_track(found, result_path)
+        job.afterwards(checkpoint.remove)
+        return found
+
+
+@contextlib.contextmanager
+def _naming(scenario_path: str | Path) -> Iterator[None]:
+    """Name the scenario's file in what is wrong with it."""
     try:
-        scenario = _with(
-            base, events, without_field_control, {"days": days, "day_interval": day_interval, "sky": sky}
-        )  # fmt: skip
-        simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
+        yield
     except (ScenarioError, GeometryError, InvalidInputError) as error:
         raise ScenarioError(f"{scenario_path}: {error}") from error
-    settings = {
-        "version": __version__,
-        "seed": str(seed),
-        "methods": " ".join(m.name for m in simulation.methods),
-        "heliostats": str(len(simulation.field)),
-    }
-    key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
-    for name, path in (("wind", scenario.tracking.wind.record), ("beam", scenario.tracking.beam_record)):
-        if path is not None:
-            key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    place = result_path.with_name(f".{result_path.name}.state")
-    checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
-    state = checkpoint.read()
-    try:
-        iq = check_with_iq(scenario, check_iq, seed=seed)
-    except InvalidInputError as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
-    if state is not None:
-        simulation.restore(state)
-    while simulation.done < simulation.n_segment:
-        simulation.advance()
-        checkpoint.write(simulation.state())
-        if on_progress is not None:
-            on_progress(simulation.done, simulation.n_segment)
-    found = track_of(simulation, settings, iq=iq)
-    write_track(found, result_path)
-    checkpoint.remove()
-    return found
 
 
 def _with(

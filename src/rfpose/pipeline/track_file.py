@@ -24,9 +24,9 @@ from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.feedback.tracking._kernels import RADIO
 from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
+from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
 from rfpose.kinds import told_kind
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
 from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck

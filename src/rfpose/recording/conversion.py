@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 import shutil
@@ -15,10 +16,10 @@ import numpy as np
 
 from rfpose import __version__
 from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.files import claim
 from rfpose.recording.base import IqArray, Recording, RecordingFormat
 from rfpose.recording.drf import CENTRE_FREQUENCIES, import_digital_rf
-from rfpose.recording.opening import open_recording
-from rfpose.recording.output import temporary_beside
+from rfpose.recording.members import members
 from rfpose.recording.sidecar import SCENARIO_FILE
 from rfpose.recording.sigmf_files import DATATYPES, META_SUFFIX, import_sigmf
 from rfpose.recording.stamps import stamp_text
@@ -56,7 +57,7 @@ def convert(
     format
         ``"rfpose-iq"``, ``"digital-rf"`` or ``"sigmf"``.
     overwrite
-        Replace an existing recording. A directory that is not a recording is never replaced.
+        Replace an existing recording, in one step. A directory that holds anything else is never replaced.
     on_progress
         Called with samples done and samples in all, over all receivers.
 
@@ -65,23 +66,30 @@ def convert(
     InvalidInputError
         Unknown ``format``.
     RecordingError
-        The target exists, cannot be written, or the format's library is missing; the source is damaged.
+        The target exists, is or holds what is read, or cannot be written; the format's library is missing; the source
+        is damaged.
     """
     if format not in get_args(RecordingFormat):
         raise InvalidInputError(f"`format` must be one of {', '.join(get_args(RecordingFormat))}, got {format!r}")
     target = Path(target_path)
-    if target.exists() and target.resolve() == source.path.resolve():
-        raise RecordingError(f"{target}: source and target are the same; choose another name")
-    _refuse_small_disk(source, target)
+    inputs = [source.path, *members(source.path)]
     if format == "rfpose-iq":
-        _to_native(source, target, overwrite, on_progress)
+        with claim(target, inputs=inputs, force=overwrite):
+            _refuse_small_disk(source, target)
+            _to_native(source, target, on_progress)
         return
-    if source.truth is not None:
-        _log.warning("%s: %s has no place for the truth of a simulation; it is left out", target, format)
     stream_writer = _DigitalRfStream if format == "digital-rf" else _SigmfStream
-    stream_writer.library()
-    with _new_directory(target, overwrite=overwrite) as directory:
-        _to_directory(source, directory, stream_writer, on_progress)
+    with claim(target, inputs=inputs, force=overwrite, directories=True) as job:
+        if target.exists():
+            _refuse_strangers(target)
+        _refuse_small_disk(source, target)
+        stream_writer.library()
+        if source.truth is not None:
+            _log.warning("%s: %s has no place for the truth of a simulation; it is left out", target, format)
+        with _library_errors(target):
+            job.part(target).mkdir()
+            _to_directory(source, job.part(target), stream_writer, on_progress)
+        job.complete(target)
 
 
 def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -> Iterator[tuple[str, int, IqArray]]:
@@ -101,8 +109,6 @@ def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -
 
 def _refuse_small_disk(source: Recording, target: Path) -> None:
     """Raise before anything is written if the disk cannot hold it; Digital RF's library dies noisily of that."""
-    if not target.parent.is_dir():
-        raise RecordingError(f"{target}: the directory `{target.parent}` does not exist; make it first")
     n_byte = _total_samples(source) * 2 * source.component_dtype.itemsize
     free = shutil.disk_usage(target.parent).free
     if free < n_byte:
@@ -116,9 +122,7 @@ def _total_samples(source: Recording) -> int:
     return sum(int(source.blocks(name)[:, 1].sum()) for name in source.receiver_ids)
 
 
-def _to_native(
-    source: Recording, target: Path, overwrite: bool, on_progress: Callable[[int, int], None] | None
-) -> None:
+def _to_native(source: Recording, target: Path, on_progress: Callable[[int, int], None] | None) -> None:
     with RecordingWriter(
         target,
         scenario=source.scenario,
@@ -128,7 +132,6 @@ def _to_native(
         sample_format=source.sample_format,
         full_scale=source.full_scale,
         provenance={**source.provenance, "converted_from": f"{source.format}: {source.path.name}"},
-        overwrite=overwrite,
     ) as writer:
         for receiver_id, start, samples in _pieces(source, on_progress):
             writer.write(receiver_id, start, samples)
@@ -158,7 +161,11 @@ class _Stream(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Complete and close the files."""
+        """Complete the files."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let the files go, complete or not."""
 
 
 class _DigitalRfStream(_Stream):
@@ -194,6 +201,9 @@ class _DigitalRfStream(_Stream):
         self._writer.rf_write(samples, start_index - self._first)
 
     def finish(self) -> None:
+        self.close()
+
+    def close(self) -> None:
         self._writer.close()
 
 
@@ -202,13 +212,17 @@ class _SigmfStream(_Stream):
 
     def __init__(self, directory: Path, receiver_id: str, source: Recording) -> None:
         super().__init__(directory, receiver_id, source)
-        self._data = directory / f"{receiver_id}.sigmf-data"
+        self._data = (directory / f"{receiver_id}.sigmf-data").open("xb")
 
     def write(self, start_index: int, samples: IqArray) -> None:
-        with self._data.open("ab") as file:
-            file.write(samples.data)
+        self._data.write(samples.data)
+
+    def close(self) -> None:
+        self._data.close()
 
     def finish(self) -> None:
+        self._data.flush()
+        os.fsync(self._data.fileno())
         meta = self.library().SigMFFile(
             global_info={
                 "core:datatype": DATATYPES[self.source.sample_format],
@@ -223,7 +237,7 @@ class _SigmfStream(_Stream):
                 capture["core:frequency"] = self.source.centre_frequency_hz
             meta.add_capture(offset, metadata=capture)
             offset += count
-        meta.tofile(str(self._data.with_suffix(META_SUFFIX)))
+        meta.tofile(str(self.directory / f"{self.receiver_id}{META_SUFFIX}"))
 
 
 def _to_directory(
@@ -232,16 +246,15 @@ def _to_directory(
     stream_writer: type[_Stream],
     on_progress: Callable[[int, int], None] | None,
 ) -> None:
-    stream: _Stream | None = None
-    for receiver_id, start, samples in _pieces(source, on_progress):
-        if stream is None or stream.receiver_id != receiver_id:
-            if stream is not None:
-                stream.finish()
-            stream = stream_writer(directory, receiver_id, source)
-        stream.write(start, samples)
-    if stream is None:
+    recorded = False
+    for receiver_id, pieces in itertools.groupby(_pieces(source, on_progress), key=lambda piece: piece[0]):
+        with contextlib.closing(stream_writer(directory, receiver_id, source)) as stream:
+            for _, start, samples in pieces:
+                stream.write(start, samples)
+            stream.finish()
+        recorded = True
+    if not recorded:
         raise RecordingError(f"{source.path}: no samples to convert; check it with `rfpose info`")
-    stream.finish()
     for receiver_id in source.receiver_ids:
         if not len(source.blocks(receiver_id)):
             _log.warning("%s: receiver `%s` recorded nothing and is left out", source.path, receiver_id)
@@ -250,22 +263,10 @@ def _to_directory(
 
 
 @contextlib.contextmanager
-def _new_directory(target: Path, *, overwrite: bool) -> Iterator[Path]:
-    """Yield an empty directory that takes ``target``'s place when the block ends well, and is removed otherwise."""
-    if target.exists():
-        if not overwrite:
-            raise RecordingError(f"{target}: exists already; choose another name or add `--force` to replace it")
-        _refuse_if_not_recording(target)
-    temporary = temporary_beside(target)
+def _library_errors(target: Path) -> Iterator[None]:
+    """Turn what the formats' libraries raise when they cannot write into ours."""
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
-        yield temporary
-        replaced = target.with_name(f".{target.name}.{os.getpid()}.old")
-        if target.exists():
-            target.replace(replaced)
-        temporary.replace(target)
-        shutil.rmtree(replaced, ignore_errors=True)
+        yield
     except RecordingError:
         raise
     except (OSError, RuntimeError) as error:
@@ -274,17 +275,16 @@ def _new_directory(target: Path, *, overwrite: bool) -> Iterator[Path]:
             f"{target}: cannot write the recording: {reason}; free space on the disk, check that the directory above "
             "exists and may be written, or write elsewhere"
         ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _refuse_if_not_recording(target: Path) -> None:
-    """Raise unless ``target`` is a directory that holds a recording: nothing else is thrown away."""
-    if not target.is_dir():
-        raise RecordingError(f"{target}: is a file, and this format is a directory; choose another name")
-    try:
-        open_recording(target).close()
-    except RecordingError as error:
+def _refuse_strangers(target: Path) -> None:
+    """Raise unless a directory holds a recording and nothing else, for all of it is thrown away."""
+    own = set(members(target))
+    strangers = sorted(path for path in target.rglob("*") if not path.is_dir() and path not in own)
+    if not own and (strangers or any(target.iterdir())):
+        raise RecordingError(f"{target}: a directory that is not a recording is never replaced; choose another name")
+    if strangers:
         raise RecordingError(
-            f"{target}: a directory that is not a recording is never replaced; choose another name"
-        ) from error
+            f"{target}: holds `{strangers[0].relative_to(target)}`, which is no part of a recording, and is not "
+            "replaced; move that away, or choose another name"
+        )

@@ -16,6 +16,7 @@ import numpy as np
 
 from rfpose import __version__
 from rfpose.errors import InvalidInputError
+from rfpose.files import Claim
 from rfpose.recording import keys
 from rfpose.recording.base import (
     COMPONENT_DTYPE,
@@ -25,7 +26,7 @@ from rfpose.recording.base import (
     SampleFormat,
     as_stored,
 )
-from rfpose.recording.output import Hdf5Output, refuse_existing
+from rfpose.recording.output import Hdf5Output
 from rfpose.scenario import ID_PATTERN, MAX_ID_LENGTH, MAX_SAMPLE_INDEX, Scenario
 from rfpose.truth import Truth
 
@@ -42,8 +43,9 @@ class RecordingWriter:
     """Write an rfpose-iq file, as a context manager.
 
     The file grows under a temporary name beside ``path`` and takes its name when the block ends without an
-    exception. Otherwise it is removed, and whatever was at ``path`` stays as it was. Nothing that depends on
-    the time of writing goes into it: equal input gives equal bytes.
+    exception, or with the `rfpose.files.claim` around it that holds ``path``. Otherwise it is removed, and whatever was
+    at ``path`` stays as it was. Interruptions wait until HDF5 has returned. Nothing that depends on the time of writing
+    goes into it: equal input gives equal bytes.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ class RecordingWriter:
     InvalidInputError
         An argument makes no sense.
     RecordingError
-        The file exists already, or cannot be written (disk full, no rights).
+        The file exists already; or, when the block begins, is being written by another process or cannot be written.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class RecordingWriter:
                     f"{receiver_id!r:.200}"
                 )
         self.path = Path(path)
-        refuse_existing(self.path, overwrite=overwrite)
+        Claim([self.path], force=overwrite).look()
         self._overwrite = overwrite
         self._scenario = scenario
         self._receiver_ids = tuple(receiver_ids)
@@ -112,6 +114,8 @@ class RecordingWriter:
         self._full_scale = float(full_scale)
         self._provenance = dict(provenance)
         self._output: Hdf5Output | None = None
+        self.n_byte = 0
+        """Size of the file when it is complete."""
         self._iq: dict[str, h5py.Dataset] = {}
         self._blocks: dict[str, list[list[int]]] = {name: [] for name in self._receiver_ids}
         self._stored = dict.fromkeys(self._receiver_ids, 0)
@@ -251,6 +255,7 @@ class RecordingWriter:
                 file[keys.RECEIVERS][receiver_id].create_dataset(keys.BLOCKS, data=table)
         self._iq.clear()
         output.commit()
+        self.n_byte = output.n_byte
 
     def _discard(self) -> None:
         """Remove what is unfinished; after a success there is nothing."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rfpose.errors import InvalidInputError, RfposeError
-from rfpose.pipeline.files import write_atomically
+from rfpose.files import write_atomically
 
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QApplication, QWidget

@@ -9,10 +9,12 @@ from typing import Any
 import click
 
 from rfpose.cli._support import (
+    check_ending,
     common_options,
     emit_json,
     examples,
     force_option,
+    outputs,
     progress,
     say,
     table,
@@ -74,13 +76,11 @@ def command(
     Each source is taken to first order and checked by Monte Carlo through the solver; the root of the sum of squares is
     compared with all sources at once. The [budget] table of the scenario says how large the sources are.
     """
-    from rfpose.pipeline.files import refuse_existing
-    from rfpose.pipeline.layout import budget_layout, draw_budget, write_budget_csv
+    check_ending(picture, ".png", ".svg")
+    claimed = outputs(output, picture, inputs=[scenario, field], force=force)
+    with claimed, progress("Drawing") as on_progress:
+        from rfpose.pipeline.layout import budget_layout, draw_budget, write_budget_csv
 
-    for path in (output, picture):
-        if path is not None:
-            refuse_existing(path, force=force)
-    with progress("Drawing") as on_progress:
         found = budget_layout(
             scenario,
             postures=postures(suns, day, year, stow),
@@ -91,10 +91,10 @@ def command(
             seed=seed,
             on_progress=on_progress,
         )
-    if output is not None:
-        write_budget_csv(found, output)
-    if picture is not None:
-        draw_budget(found, picture)
+        if output is not None:
+            write_budget_csv(found, output)
+        if picture is not None:
+            draw_budget(found, picture)
     summary = found.as_dict()
     if wants_json():
         emit_json({**summary, "output": output, "picture": picture})

@@ -8,7 +8,18 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, force_option, say, table, wants_json
+from rfpose.cli._support import (
+    check_ending,
+    common_options,
+    emit_json,
+    examples,
+    force_option,
+    outputs,
+    progress,
+    say,
+    table,
+    wants_json,
+)
 from rfpose.cli.layout._options import ESTIMATORS, field_options, postures
 
 __all__ = ["command"]
@@ -55,34 +66,32 @@ def command(
     force: bool,
 ) -> None:
     """Say what each mirror's normal can be known to, and what the loss of each transmitter costs."""
-    from rfpose.layout.sight import Plates, Tower
-    from rfpose.pipeline.files import refuse_existing
-    from rfpose.pipeline.layout import Sight, draw_layout_map, map_layout, write_layout_csv
-
     if (tower is not None or behind) and plate is None:
         raise click.UsageError("--tower and --behind need --line-of-sight WIDTH HEIGHT, the size of the plates")
-    for path in (picture, csv_path):
-        if path is not None:
-            refuse_existing(path, force=force)
-    sight = None
-    if plate is not None:
-        sight = Sight(
-            plates=Plates(width_m=plate[0], height_m=plate[1], flush="back" if behind else "front"),
-            tower=None if tower is None else Tower(radius_m=tower[0], top_m=tower[1]),
+    check_ending(picture, ".png", ".svg")
+    with outputs(picture, csv_path, inputs=[scenario, field], force=force), progress("Mapping"):
+        from rfpose.layout.sight import Plates, Tower
+        from rfpose.pipeline.layout import Sight, draw_layout_map, map_layout, write_layout_csv
+
+        sight = None
+        if plate is not None:
+            sight = Sight(
+                plates=Plates(width_m=plate[0], height_m=plate[1], flush="back" if behind else "front"),
+                tower=None if tower is None else Tower(radius_m=tower[0], top_m=tower[1]),
+            )
+        found = map_layout(
+            scenario,
+            estimators=estimators or None,
+            postures=postures(suns, day, year, stow),
+            field_csv=field,
+            tone_snr_db=tone_snr_db,
+            sight=sight,
+            sensitivity=sensitivity,
         )
-    found = map_layout(
-        scenario,
-        estimators=estimators or None,
-        postures=postures(suns, day, year, stow),
-        field_csv=field,
-        tone_snr_db=tone_snr_db,
-        sight=sight,
-        sensitivity=sensitivity,
-    )
-    if picture is not None:
-        draw_layout_map(found, picture)
-    if csv_path is not None:
-        write_layout_csv(found, csv_path)
+        if picture is not None:
+            draw_layout_map(found, picture)
+        if csv_path is not None:
+            write_layout_csv(found, csv_path)
     summary = found.as_dict()
     if wants_json():
         emit_json({**summary, "picture": picture, "csv": csv_path})

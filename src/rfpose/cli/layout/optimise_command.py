@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rfpose.cli._support import (
+    check_ending,
     common_options,
     emit_json,
     examples,
     force_option,
+    outputs,
     progress,
     say,
     table,
@@ -21,7 +23,7 @@ from rfpose.cli._support import (
 from rfpose.cli.layout._options import CRITERIA, field_options, postures
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.layout import Rules
+    from rfpose.pipeline.layout import Rules, SitePlacement, SitePlacements
 
 __all__ = ["command"]
 
@@ -100,30 +102,33 @@ def command(
     **where: Any,
 ) -> None:
     """Place the transmitters anew, for the best accuracy that the limits allow."""
-    from rfpose.layout.optimise import Costs
-    from rfpose.pipeline.files import refuse_existing
-
     if pareto is not None and (output is not None or transmitters is not None):
         raise click.UsageError("--pareto compares numbers of transmitters; give -o and -n without it")
     if pareto is None and (csv_path is not None or picture is not None):
         raise click.UsageError("--csv and --picture go with --pareto")
-    for path in (output, csv_path, picture):
-        if path is not None:
-            refuse_existing(path, force=force)
-    settings: dict[str, Any] = {
-        "criterion": minimise,
-        "statistic": statistic,
-        "rules": _rules(**where),
-        "costs": Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
-        "postures": postures(suns, day, year, stow),
-        "field_csv": field,
-        "starts": starts,
-        "seed": seed,
-    }
+    check_ending(picture, ".png", ".svg")
+    claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline"]], force=force)
+    with claimed:
+        from rfpose.layout.optimise import Costs
+
+        settings: dict[str, Any] = {
+            "criterion": minimise,
+            "statistic": statistic,
+            "rules": _rules(**where),
+            "costs": Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
+            "postures": postures(suns, day, year, stow),
+            "field_csv": field,
+            "starts": starts,
+            "seed": seed,
+        }
+        if pareto is not None:
+            curve = _compare(scenario, pareto, settings, csv_path, picture)
+        else:
+            found = _place(scenario, transmitters, settings, output)
     if pareto is not None:
-        _compare(scenario, pareto, settings, csv_path, picture)
-        return
-    _place(scenario, transmitters, settings, output)
+        _show_curve(curve.as_dict(), csv_path, picture)
+    else:
+        _show_places(found.as_dict(), output)
 
 
 def _rules(
@@ -150,15 +155,19 @@ def _rules(
     )
 
 
-def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None) -> None:
-    from rfpose.pipeline.files import write_atomically
+def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None) -> SitePlacement:
+    from rfpose.files import write_atomically
     from rfpose.pipeline.layout import optimise_layout
 
     with progress("Searching") as on_progress:
         found = optimise_layout(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
     if output is not None:
         write_atomically(output, found.scenario.to_toml().encode())
-    summary = found.as_dict()
+    return found
+
+
+def _show_places(summary: dict[str, Any], output: Path | None) -> None:
+    """Print where the transmitters should stand."""
     if wants_json():
         emit_json({**summary, "output": output})
         return
@@ -173,7 +182,7 @@ def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], o
 
 def _compare(
     scenario: Path, counts: range, settings: dict[str, Any], csv_path: Path | None, picture: Path | None
-) -> None:
+) -> SitePlacements:
     from rfpose.pipeline.layout import draw_placements, pareto_layout, write_placements_csv
 
     with progress("Searching, number by number") as on_progress:
@@ -182,7 +191,11 @@ def _compare(
         write_placements_csv(curve, csv_path)
     if picture is not None:
         draw_placements(curve, picture)
-    summary = curve.as_dict()
+    return curve
+
+
+def _show_curve(summary: dict[str, Any], csv_path: Path | None, picture: Path | None) -> None:
+    """Print what each number of transmitters would buy."""
     if wants_json():
         emit_json({**summary, "csv": csv_path, "picture": picture})
         return

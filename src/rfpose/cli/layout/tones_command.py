@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, say, table, wants_json
+from rfpose.cli._support import common_options, emit_json, examples, progress, say, table, wants_json
 
 __all__ = ["command"]
 
@@ -44,18 +44,19 @@ def command(
     share: str,
 ) -> None:
     """Choose the tones that reach an accuracy of the normals, with integers that are safe."""
-    from rfpose.pipeline.layout.toning import design_site_tones
+    with progress("Searching"):
+        from rfpose.pipeline.layout.toning import design_site_tones
 
-    found = design_site_tones(
-        scenario,
-        accuracy_mrad=accuracy_mrad,
-        success=success,
-        band_hz=band,
-        n_tone=n_tone,
-        estimator=estimator,
-        tone_snr_db=tone_snr_db,
-        share=share,  # type: ignore[arg-type]
-    ).as_dict()
+        found = design_site_tones(
+            scenario,
+            accuracy_mrad=accuracy_mrad,
+            success=success,
+            band_hz=band,
+            n_tone=n_tone,
+            estimator=estimator,
+            tone_snr_db=tone_snr_db,
+            share=share,  # type: ignore[arg-type]
+        ).as_dict()
     if wants_json():
         emit_json(found)
         return

@@ -13,8 +13,8 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.files import write_atomically
 from rfpose.layout.budget import BudgetLine, ErrorBudget, error_budget, make_plan
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.layout.site import Postures, load_site, postures_of, stacked
 from rfpose.pipeline.pictures import _new_figure, _save
 from rfpose.scenario import Scenario

@@ -13,6 +13,7 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, ScenarioError
+from rfpose.files import write_atomically
 from rfpose.layout import maps
 from rfpose.layout.fields import read_positions
 from rfpose.layout.maps import Mirrors
@@ -27,7 +28,6 @@ from rfpose.layout.optimise import (
     pareto,
     scenario_with,
 )
-from rfpose.pipeline.files import write_atomically
 from rfpose.pipeline.layout.site import Postures, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures import _new_figure, _save
 from rfpose.scenario import Scenario

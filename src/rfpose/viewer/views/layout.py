@@ -34,7 +34,7 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.errors import RfposeError
-from rfpose.pipeline.files import write_atomically
+from rfpose.files import write_atomically
 from rfpose.pipeline.live_layout import (
     ESTIMATOR_NAMES,
     OPTIMISED,
