@@ -168,16 +168,16 @@ def test_drf_damaged_file(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_drf_end_that_the_library_complains_about(tmp_path, capsys, caplog):
-    """The library prints; a command that promises JSON alone on standard output must not."""
+def test_drf_file_without_samples_is_told(tmp_path, capsys):
+    """A command that promises JSON alone on standard output prints nothing else."""
     write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
     last = max((tmp_path / "d" / "r0").rglob("rf@*.h5"))
     with h5py.File(last, "w"):
         pass
     with open_recording(tmp_path / "d") as r:
         assert r.blocks("r0").tolist() == [[EPOCH, 20_000]]
+        assert f"r0: its file `{last.name}` is corrupt: it holds no samples" in describe(r)["problems"]
     assert capsys.readouterr().out == ""
-    assert "corrupt file" in caplog.text
 
 
 def test_drf_that_loses_a_file_while_open(tmp_path):

@@ -99,8 +99,11 @@ class DigitalRfRecording(Recording):
         self._pieces: dict[str, list[_Piece]] = {}
         self._opened: dict[str, tuple[Path, h5py.File, h5py.Dataset]] = {}
         self._told: dict[str, list[str]] = {name: [] for name in self._place}
-        for name, (channel_name, _) in self._place.items():
-            self._told[name] += _unfinished(self._channels[channel_name].directory)
+        for channel_name, channel in self._channels.items():
+            for doubt in _unfinished(channel.directory):
+                self._tell(channel_name, doubt)
+            if channel.files:  # its properties do not say whether integers have a sign
+                self._pieces_in(channel_name, channel.files[0])
         super().__init__(
             path,
             format="digital-rf",
@@ -142,8 +145,7 @@ class DigitalRfRecording(Recording):
         try:
             with h5py.File(path, "r") as file:
                 if file.get("rf_data", getlink=True) is None or file.get("rf_data_index", getlink=True) is None:
-                    _log.warning("%s: corrupt file, without samples; it is left out", path)
-                    self._tell(channel, f"its file `{path.name}` holds no samples")
+                    self._tell(channel, f"its file `{path.name}` is corrupt: it holds no samples")
                     return []
                 n_sample = len(_samples(file, self._channels[channel], self._follow_links))
                 table = _index(file, n_sample, self._follow_links)
@@ -188,6 +190,7 @@ class DigitalRfRecording(Recording):
         return self._opened[channel][2]
 
     def _tell(self, channel: str, doubt: str) -> None:
+        _log.info("%s: channel %s: %s", self._channels[channel].directory, channel, doubt)
         for name, (own, _) in self._place.items():
             if own == channel and doubt not in self._told[name]:
                 self._told[name].append(doubt)

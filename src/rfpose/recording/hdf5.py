@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import os
 from collections import deque
 from typing import Final
 
@@ -102,8 +103,9 @@ def find_dataset(file: h5py.File, place: str, *, follow_links: bool, per_stored:
             f"{where} is compressed in chunks of {chunk / 1e9:.3g} GB, each of which must be inflated as a whole; "
             "write it again in chunks of about 1 MB"
         )
-    declared = math.prod(item.shape or (0,)) * item_bytes
-    stored = item.id.get_storage_size()
+    declared = 0 if item.shape is None else math.prod(item.shape) * item_bytes
+    # of what was never written HDF5 counts as stored what it would take
+    stored = min(item.id.get_storage_size(), os.stat(file.filename).st_size)
     if not elsewhere and declared > _UNSTORED_BYTES + per_stored * stored:
         raise RecordingError(
             f"{where} declares {declared / 1e9:.3g} GB, of which {stored / 1e9:.3g} GB are stored; the file is damaged "

@@ -49,7 +49,7 @@ class NativeRecording(Recording):
             fields.check_format()
             sample_format = fields.text(keys.SAMPLE_FORMAT)
             if sample_format not in STORED_DTYPE:
-                raise fields.error(keys.SAMPLE_FORMAT, f"must be int16 or complex64, is {sample_format!r}")
+                raise fields.error(keys.SAMPLE_FORMAT, f"must be int16 or complex64, is {sample_format!r:.60}")
             self._iq: dict[str, h5py.Dataset] = {}
             super().__init__(
                 path,
@@ -159,7 +159,7 @@ class _Fields:
                 )
             raise RecordingError(
                 f"{self._path}: an HDF5 file of another format (attribute `{keys.FORMAT}` of `/` must be "
-                f"{keys.FORMAT_NAME!r}, is {found!r}); give an rfpose-iq file or convert it with `rfpose convert`"
+                f"{keys.FORMAT_NAME!r}, is {found!r:.60}); give an rfpose-iq file or convert it with `rfpose convert`"
             )
         version = self.integer(keys.VERSION)
         if version != keys.FORMAT_VERSION:
