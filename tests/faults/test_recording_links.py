@@ -168,7 +168,13 @@ def test_the_flag_is_the_same_on_every_command(make, private, tmp_path, argument
     assert "follow-links" not in allowed.output
 
 
-@pytest.mark.parametrize("name", ["/dev/zero", "/etc", ".", "..", "", "a\\u0000b"])
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b"], ids=["long", "zero"])
+def test_paths_that_are_none(name):
+    with pytest.raises(RecordingError, match="check the path"):
+        open_recording(name)
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "/etc", ".", "..", "", "a\\u0000b", pytest.param("x" * 5000, id="long")])
 def test_names_that_are_no_file_of_samples(make, name):
     path = make(SIGMF)
     meta = path / "a.sigmf-meta"

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 from fractions import Fraction
 from pathlib import Path
 
@@ -266,9 +267,47 @@ def test_sigmf_time(tmp_path, captures, blocks):
         assert np.array_equal(np.concatenate(got), x)
 
 
+def test_sigmf_without_time_is_not_sound(tmp_path):
+    write_sigmf(tmp_path / "s", "r0", counts(1000) // 2, [{"core:sample_start": 0}])
+    write_sigmf(tmp_path / "s", "r1", counts(1000) // 2, [{"core:sample_start": 0, "core:global_index": 77}])
+    with open_recording(tmp_path / "s") as r:
+        summary = describe(r)
+    assert summary["start_unix_s"] is None
+    assert summary["start_utc"] is None
+    assert [problem.split(":")[0] for problem in summary["problems"]] == ["r0", "r1"]
+    assert all("when it was recorded is not known" in problem for problem in summary["problems"])
+
+
+def test_sigmf_stamps_beside_the_grid_are_told(tmp_path):
+    for name, stamp in (("r0", f"{DAY}.000000000Z"), ("r1", f"{DAY}.000000400Z")):
+        capture = {"core:sample_start": 0, "core:datetime": stamp}
+        write_sigmf(tmp_path / "s", name, counts(1000) // 2, [capture])
+    with open_recording(tmp_path / "s") as r:
+        (problem,) = describe(r)["problems"]
+    assert problem.startswith("r1: its time stamps lie 0.4 samples (0.4 µs) beside the sample grid")
+
+
+def test_sigmf_annotations_and_undeclared_extensions_are_no_faults(tmp_path):
+    directory = write_sigmf(tmp_path / "s", "r", counts(1000), [], **{"mine:gain": 3})
+    meta = directory / "r.sigmf-meta"
+    content = json.loads(meta.read_text())
+    content["annotations"] = [{"core:sample_start": 10, "core:sample_count": 10**9}]
+    meta.write_text(json.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with open_recording(directory) as r:
+            assert r.blocks("r").tolist() == [[0, 1000]]
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ({"rate": math.nan}, "`global.core:sample_rate` is nan"),
+        ({"rate": 1e-9}, "`core:sample_rate` must be a rate from"),
+        ({"rate": 1e13}, "`global.core:sample_rate`: 10000000000000.0 is greater than the maximum"),
+        ({"core:dataset": 5}, "`core:dataset` must be a file name, got 5"),
+        ({"captures": [{"core:sample_start": 0, "core:datetime": "2026-02-30T12:00:00Z"}]}, "no time of Unix"),
+        ({"captures": [{"core:sample_start": 0, "core:global_index": 2**62}]}, "must be a whole number below 2\\^62"),
         ({"datatype": "cu8"}, "`core:datatype` is cu8; rfpose reads ci16 and cf32"),
         ({"core:offset": 100}, "`core:offset` is not supported"),
         ({"core:num_channels": 2}, "interleaved channels"),

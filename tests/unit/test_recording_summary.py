@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from rfpose.cli import app
 from rfpose.errors import ScenarioError
 from rfpose.recording import RecordingWriter, check_against, describe, open_recording
 from rfpose.scenario import load_scenario
@@ -109,6 +111,68 @@ def test_pieces_run_across_gaps(tmp_path):
     assert summary["stretches"] == 200
     assert summary["recorded_s"] == 2.0
     assert summary["span_s"] == pytest.approx(3.99)
+
+
+def bursts(path, starts_by_receiver, count, *, jump=10**6, n_burst=4):
+    """Write bursts every ``jump`` samples; a receiver's start of None in a burst is one that it missed."""
+    with RecordingWriter(
+        path, scenario=None, receiver_ids=list(starts_by_receiver), sample_rate=Fraction(10**6),
+        centre_frequency_hz=None, sample_format="int16", full_scale=32767, provenance={},
+    ) as writer:  # fmt: skip
+        for name, starts in starts_by_receiver.items():
+            for k in range(n_burst):
+                if starts[k] is not None:
+                    writer.write(name, 10**15 + k * jump + starts[k], noise(count))
+    with open_recording(path) as recording:
+        return describe(recording)
+
+
+def test_pauses_that_all_receivers_make_are_no_losses(tmp_path):
+    summary = bursts(tmp_path / "r.h5", {"a": [0, 0, 0, 0], "b": [0, 3, 1, 6], "c": [0, 0, None, 0]}, 1000)
+    assert {name: entry["lost_samples"] for name, entry in summary["receivers"].items()} == {"a": 0, "b": 0, "c": 1001}
+    assert summary["problems"] == []
+    assert summary["stretches"] == 4
+
+
+def test_a_gap_while_others_record_is_a_loss(tmp_path):
+    summary = bursts(tmp_path / "r.h5", {"a": [0, 0, 0, 0], "b": [0, 20, 20, 20]}, 1000, jump=1000)
+    assert summary["receivers"]["b"]["lost_samples"] == 20
+    assert summary["receivers"]["a"]["lost_samples"] == 0
+
+
+def test_dates_stand_beside_the_index(tmp_path):
+    summary = bursts(tmp_path / "r.h5", {"a": [0, 0, 0, 0]}, 1000)
+    assert summary["start_index"] == 10**15
+    assert summary["start_utc"] == "2001-09-09T01:46:40.000000000Z"
+    assert summary["end_utc"] == "2001-09-09T01:46:43.001000000Z"
+
+
+def test_receivers_so_far_apart_that_they_share_no_frame_are_told(tmp_path):
+    radio = SCENARIO.radio.model_copy(update={"frame_samples": 1000})
+    with RecordingWriter(
+        tmp_path / "r.h5", scenario=SCENARIO.model_copy(update={"radio": radio}), receiver_ids=SCENARIO.receiver_ids,
+        sample_rate=Fraction(40_000_000), centre_frequency_hz=1e8, sample_format="int16", full_scale=32767,
+        provenance={},
+    ) as writer:  # fmt: skip
+        for k, name in enumerate(SCENARIO.receiver_ids):
+            writer.write(name, 10**15 + (600 if k < 2 else 0), noise(1000))
+    with open_recording(tmp_path / "r.h5") as recording:
+        summary = describe(recording)
+    (problem,) = summary["problems"]
+    assert problem.startswith(
+        "2 receivers (`H01_r0`, `H01_r1`): recorded 1 frames of 1000 samples, but lies so far beside"
+    )
+    assert [entry["frames"] for entry in summary["receivers"].values()] == [0, 0] + [1] * (
+        len(SCENARIO.receiver_ids) - 2
+    )
+
+
+def test_info_sums_up_receivers_that_are_alike(tmp_path):
+    bursts(tmp_path / "r.h5", {"a": [0, 0, 0, 0], "b": [0, 0, 0, 0], "c": [0, 0, None, 0]}, 1000)
+    shown = CliRunner().invoke(app, ["info", str(tmp_path / "r.h5")])
+    rows = [line for line in shown.output.splitlines() if "samples" in line and "blocks" in line]
+    assert [row.split(":")[0].strip() for row in rows] == ["a … b (2 alike)", "c"]
+    assert "receivers: 3" in shown.output
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,11 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None, follow
         The embedded scenario is malformed.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        exists = path.exists()
+    except (OSError, ValueError) as error:  # too long, or with a zero byte
+        raise RecordingError(f"{str(path)!r:.200}: no path of a file ({error!s:.60}); check the path") from error
+    if not exists:
         raise RecordingError(f"{path}: no such file or directory; check the path")
     if path.is_dir():
         return _open_directory(path, scenario, follow_links=follow_links)

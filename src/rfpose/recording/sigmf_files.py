@@ -134,6 +134,11 @@ def _load(library: Any, meta: Path, *, follow_links: bool) -> _Stream:
         return _stream(meta, content, follow_links=follow_links)
     except InvalidInputError as error:
         raise RecordingError(f"{meta}: {error}; correct the file") from error
+    except RecordingError:
+        raise
+    except OSError as error:  # a name that is too long, a folder that may not be looked into
+        what = error.strerror or error
+        raise RecordingError(f"{meta}: cannot read the file of samples: {what}; check its name and rights") from error
 
 
 def _check_schema(library: Any, content: Any) -> None:
