@@ -159,6 +159,52 @@ def test_calibration_receivers_each_have_a_reflection_of_their_own(far_apart: Re
     assert found.sigma_mrad == pytest.approx(found.bound_mrad, rel=0.1)
 
 
+# -- what cannot be known ------------------------------------------------------------------------------------
+
+
+def _as_measured(scenario: Scenario, directory: Path, name: str) -> Result:
+    path = recorded(scenario, directory, name)
+    return process(path, path.with_name(f"{name}_r.h5"), estimator="correlator")
+
+
+def _among(thickness_m: float, pivot_height_m: float) -> Scenario:
+    """Mirrors between transmitters about 2 m high."""
+    data = site({"receiver_delay_sigma_s": 0.0}, {"frame_count": 3}).model_dump(exclude_none=True)
+    heights = 2.0 + thickness_m * np.random.default_rng(5).uniform(-0.5, 0.5, len(data["transmitter"]))
+    for transmitter, height in zip(data["transmitter"], heights, strict=True):
+        transmitter["position_enu_m"] = (*transmitter["position_enu_m"][:2], height)
+    for k, heliostat in enumerate(data["heliostat"]):
+        heliostat["pivot_enu_m"] = (*heliostat["pivot_enu_m"][:2], 2.0 + (-1.0) ** k * pivot_height_m)
+    return Scenario.model_validate(data)
+
+
+def test_mirrors_among_level_transmitters_have_an_image_and_say_so(tmp_path: Path) -> None:
+    result = _as_measured(_among(0.0, 2.5), tmp_path, "level")
+    assert np.all(result.poses.status == PoseStatus.AMBIGUOUS)
+    assert np.all(np.isfinite(result.poses.normal_enu))
+    found = evaluate(result)
+    assert (found.solved, found.failed) == (0, 12)
+
+
+def test_mirrors_among_nearly_level_transmitters_are_solved_from_both_sides(tmp_path: Path) -> None:
+    result = _as_measured(_among(2.0, 2.5), tmp_path, "nearly")
+    found = evaluate(result)
+    assert found.solved == 12
+    assert found.ratio_to_bound < 1.0 + 4.5 / np.sqrt(4.0 * 12)
+
+
+@pytest.mark.parametrize("pose", ["rigid", "independent"])
+def test_a_pose_that_tells_nothing_is_not_solved(tmp_path: Path, pose: str) -> None:
+    scenario = site({}, {"frame_count": 3, "tone_snr_db": 0.0}, tone_hz=(0.75e6,))
+    path = recorded(scenario, tmp_path, "weak")
+    result = process(path, tmp_path / "r.h5", estimator="correlator", pose=pose)
+    found = evaluate(result)
+    assert np.all(result.poses.sigma_rad[result.poses.status == PoseStatus.OK] <= 0.1)
+    assert found.solved == 0
+    assert np.any(result.poses.status == PoseStatus.UNCERTAIN)
+    assert any("0.1 rad" in reason for reason in found.failure_reasons)
+
+
 # -- bad transmitters ----------------------------------------------------------------------------------------
 
 

@@ -109,6 +109,28 @@ PATTERNS = {
 }
 
 
+def test_what_was_chosen_for_fitting_is_less_certain_than_it_looks():
+    """Half of the transmitters off by a few sigma, or all a little: where some were left out, errors are as stated."""
+    for n_bad, size in ((5, 5.0), (7, 5.0), (10, 2.0)):
+        rng = np.random.default_rng(n_bad)
+        z = np.concatenate([measure(30 + k) for k in range(200)])
+        bad = np.argsort(rng.random((len(z), 10)), axis=1) < n_bad
+        z += size * SIGMA * bad[:, None, None, :] * rng.standard_normal(z.shape)
+        rot = np.tile(ROT, (200, 1, 1))
+        start = {"start_pivot_enu_m": np.tile(PIVOT + 0.2, (200, 1)), "start_rot_enu_from_mirror": rot}
+        found = solve_with_integrity(TRANSMITTER, PLACES, z, **{**settings(), **start}, false_alarm=1e-3)
+        left_out = (found.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) & found.ok
+        assert left_out.sum() > 50
+        sigma = found.poses.tilt_sigma_rad[left_out]
+        error = np.linalg.norm(found.poses.normal_enu - rot[:, :, 2], axis=1)[left_out]
+        assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+        assert np.all(error < 5.0 * sigma)
+        # the protection level is what it exceeds with the missed-detection probability
+        allowed = found.protection_level_rad[left_out] / np.sqrt(-2.0 * np.log(1e-3))
+        assert np.all(sigma > 0.999 * allowed)
+        assert np.all(sigma < 1.001 * np.sqrt(2.0) * allowed)
+
+
 @pytest.mark.parametrize("size_sigma", [40.0, 1000.0])
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_an_error_is_found_named_and_left_out(pattern, size_sigma):

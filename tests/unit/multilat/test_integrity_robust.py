@@ -88,3 +88,13 @@ def test_settings_are_checked(wrong):
     _, ranges, _ = measure(6)
     with pytest.raises(InvalidInputError):
         locate_robust(TRANSMITTER, ranges, sigma_m=SIGMA, **wrong)
+
+
+def test_two_sides_that_fit_alike_are_said_to_do_so():
+    level = TRANSMITTER * [1.0, 1.0, 0.0] + [0.0, 0.0, 10.0]
+    place = np.array([[10.0, 20.0, 2.0], [-30.0, 10.0, 18.0]])
+    ranges = np.linalg.norm(place[:, None] - level, axis=-1)
+    assert np.all(locate_robust(level, ranges, sigma_m=SIGMA, side=None).status == FixStatus.AMBIGUOUS)
+    found = locate_robust(level, ranges, sigma_m=SIGMA, side=None, height_enu_m=place[:, 2], height_sigma_m=1.0)
+    assert found.ok.all()
+    np.testing.assert_allclose(found.position_enu_m, place, atol=1e-3)

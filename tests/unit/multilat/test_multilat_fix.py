@@ -66,6 +66,89 @@ def test_transmitters_of_one_height_locate_receivers_below_them():
     np.testing.assert_allclose(above.position_enu_m, [0, 0, 60] + PLACE * [1, 1, -1], atol=1e-6)
 
 
+ROUND = 100.0 * np.stack([np.cos(np.arange(10) * 0.63), np.sin(np.arange(10) * 0.63)], axis=1)
+
+
+def nearly_level(rng, thickness):
+    """Ten transmitters about a height of 2 m, at radii that differ."""
+    height = 2.0 + thickness * rng.uniform(-0.5, 0.5, 10)
+    return np.column_stack([ROUND * rng.uniform(0.4, 1.0, (10, 1)), height])
+
+
+def in_sigmas(fixes, place):
+    off = fixes.position_enu_m - place
+    return np.sqrt(np.einsum("na,nab,nb->n", off, np.linalg.pinv(np.nan_to_num(fixes.cov_enu_m2)), off))
+
+
+@pytest.mark.parametrize("thickness", [0.4, 2.0, 8.0])
+def test_a_fix_is_not_on_the_wrong_side_of_nearly_level_transmitters(thickness):
+    rng = np.random.default_rng(11)
+    ok = decided = 0
+    for _ in range(8):
+        transmitter = nearly_level(rng, thickness)
+        place = np.column_stack([rng.uniform(-60.0, 60.0, (400, 2)), 2.0 + rng.choice([-1.0, 1.0], 400) * 6.0])
+        ranges = np.linalg.norm(place[:, None] - transmitter, axis=-1) + 0.02 * rng.standard_normal((400, 10))
+        fixes = locate(transmitter, ranges, sigma_m=0.02, side=None)
+        assert np.all(in_sigmas(fixes, place)[fixes.ok] < 6.0)
+        ok += fixes.ok.sum()
+        # told the side, every one is right
+        side = np.where(place[:, 2] > 2.0, "above", "below")
+        known = locate(transmitter, ranges, sigma_m=0.02, side=side.tolist())
+        assert np.all(in_sigmas(known, place)[known.ok] < 6.0)
+        assert not np.any(known.status == FixStatus.AMBIGUOUS)
+        decided += known.ok.sum()
+        unclear = fixes.status == FixStatus.AMBIGUOUS
+        assert np.all(fixes.position_enu_m[unclear, 2] < 3.0)
+    # what is not told is said to be so: the more level, the more often
+    assert ok < decided if thickness < 1.0 else ok > 0.9 * decided
+
+
+def test_level_transmitters_alone_tell_no_side():
+    level = nearly_level(np.random.default_rng(12), 0.0)
+    place = np.array([[10.0, 20.0, -5.0], [-30.0, 15.0, 9.0]])
+    ranges = np.linalg.norm(place[:, None] - level, axis=-1)
+    fixes = locate(level, ranges, sigma_m=1e-3, side=None)
+    assert np.all(fixes.status == FixStatus.AMBIGUOUS)
+    np.testing.assert_allclose(fixes.position_enu_m, place * [1, 1, 1] - [[0, 0, 0], [0, 0, 14.0]], atol=1e-5)
+    known = locate(level, ranges, sigma_m=1e-3, side=["below", "above"])
+    assert known.ok.all()
+    np.testing.assert_allclose(known.position_enu_m, place, atol=1e-5)
+    assert "mirrored" in fixes.reasons()[0]
+
+
+def test_what_was_received_decides_whether_there_is_an_image():
+    # two of nine stand high; a row that misses them sees seven of one height
+    transmitter = nearly_level(np.random.default_rng(13), 0.0)[:9]
+    transmitter[[3, 7], 2] = 30.0
+    place = np.array([[10.0, 20.0, -5.0], [10.0, 20.0, -5.0]])
+    ranges = np.linalg.norm(place[:, None] - transmitter, axis=-1)
+    ranges[1, [3, 7]] = np.nan
+    fixes = locate(transmitter, ranges, sigma_m=1e-3, side=None)
+    assert fixes.status.tolist() == [FixStatus.OK, FixStatus.AMBIGUOUS]
+
+
+def test_in_the_plane_transmitters_near_a_line_have_an_image_too():
+    rng = np.random.default_rng(14)
+    transmitter = np.column_stack([np.linspace(-100.0, 100.0, 9), 0.3 * rng.standard_normal(9)])
+    place = np.column_stack([rng.uniform(-80.0, 80.0, 600), rng.choice([-1.0, 1.0], 600) * rng.uniform(10, 40, 600)])
+    ranges = np.linalg.norm(place[:, None] - transmitter, axis=-1) + 0.05 * rng.standard_normal((600, 9))
+    fixes = locate(transmitter, ranges, sigma_m=0.05)
+    assert np.all(in_sigmas(fixes, place)[fixes.ok] < 6.0)
+    assert np.any(fixes.status == FixStatus.AMBIGUOUS)
+    assert fixes.ok.any()
+
+
+def test_a_fix_that_knows_next_to_nothing_is_not_solved():
+    rng = np.random.default_rng(15)
+    ranges = np.tile(RANGES, (400, 1)) + 12.0 * rng.standard_normal((1200, 7))
+    fixes = locate(TRANSMITTER, ranges, sigma_m=12.0)
+    extent = np.sqrt(np.mean(np.sum((TRANSMITTER - TRANSMITTER.mean(axis=0)) ** 2, axis=1)))
+    sigma = np.sqrt(np.trace(fixes.cov_enu_m2, axis1=1, axis2=2))
+    assert np.all(sigma[fixes.ok] <= 0.25 * extent)
+    assert np.any(fixes.status == FixStatus.UNCERTAIN)
+    assert np.all(sigma[fixes.status == FixStatus.UNCERTAIN] > 0.25 * extent)
+
+
 def test_dilution_over_the_limit_is_marked():
     limit = float(dop(TRANSMITTER, PLACE[0])) * 0.99
     fixes = locate(TRANSMITTER, RANGES[:1], sigma_m=1e-3, max_dop=limit)
@@ -125,6 +208,8 @@ def test_a_geometry_without_solution_is_refused(transmitter, match):
         ({"max_iteration": 0}, "max_iteration"),
         ({"min_probability": 1.0}, "min_probability"),
         ({"side": "left"}, "side"),
+        ({"side": ["below", "left", None]}, "side"),
+        ({"side": ["below", None]}, "one a receiver"),
     ],
 )
 def test_mistakes_are_named(change, match):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror, unit
@@ -41,6 +42,31 @@ def test_known_places_make_numbering_free_and_need_no_plane(mirror):
     order = np.random.default_rng(1).permutation(len(mirror))
     normals = mirror_normal(placed(mirror)[order], identity(len(mirror)), receiver_mirror_m=mirror[order])
     np.testing.assert_allclose(normals.normal_enu, FACING, atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("n", [3, 5])
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+@pytest.mark.parametrize("width", [1e-6, 3e-4, 2e-3, 0.02, 0.2])
+def test_receivers_nearly_on_a_line_claim_no_normal(width, noise, n, known):
+    """Places on 1 m by ``width``: what is called OK is off by what it says."""
+    rng = np.random.default_rng(4)
+    angle = 2.0 * np.pi * np.arange(n) / n
+    places = np.stack([np.cos(angle), width * np.sin(angle), 0.0 * angle], axis=-1)
+    rot = Rotation.random(1000, random_state=rng).as_matrix()
+    position = np.einsum("mab,kb->mka", rot, places) + noise * rng.standard_normal((1000, n, 3))
+    cov = np.broadcast_to(noise**2 * np.eye(3 * n), (1000, 3 * n, 3 * n))
+    found = mirror_normal(position, cov, receiver_mirror_m=places if known else None)
+    assert np.isfinite(found.normal_enu[found.ok]).all()
+    assert np.all(found.sigma_rad[found.ok] <= 0.1)
+    off = np.linalg.norm(found.normal_enu - rot[:, :, 2], axis=1)
+    assert np.all(off[found.ok] < 8.0 * found.sigma_rad[found.ok])
+    if width < 1e-3:
+        assert not found.ok.any()
+        if known:
+            assert np.all(found.status == PoseStatus.COLLINEAR)
+    if width == 0.2 and noise == 0.002:
+        assert found.ok.all()
 
 
 @pytest.mark.parametrize("known", [False, True])

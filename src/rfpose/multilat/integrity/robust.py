@@ -52,7 +52,8 @@ class RobustFixes:
     chi2, dof : (receiver,)
         Of the observations used. Without degrees of freedom nothing confirms the choice of outliers.
     status : (receiver,)
-        `FixStatus` as int8; RESIDUAL: what is left is still unlikely.
+        `FixStatus` as int8; RESIDUAL: what is left is still unlikely; AMBIGUOUS: it fits alike on the other side of the
+        transmitters' plane.
     """
 
     position_enu_m: FloatArray
@@ -103,7 +104,7 @@ def locate_robust(
     height_sigma_m
         Its standard deviation, were it no outlier [m].
     side
-        As in `rfpose.multilat.locate`, for the start.
+        As in `rfpose.multilat.locate`.
     outlier_sigma
         Residual, in sigmas, beyond which an observation is left out.
     min_probability
@@ -142,7 +143,11 @@ def locate_robust(
     left = problem.left(state)
     outlier = problem.seen & (np.abs(left) > outlier_sigma * problem.sigma)
     state, cov, singular = _least_squares(problem, state, problem.weight * ~outlier)
-    return _result(problem, state, cov, singular, outlier, min_probability)
+    # what is left may fit as well on the other side of the transmitters' plane; a height tells the sides apart
+    kept = np.where(outlier[:, :-1], np.nan, ranges)
+    last = locate(transmitter, kept, sigma_m=sigma_m, side=side, max_dop=np.inf, min_probability=0.0)
+    ambiguous = (last.status == FixStatus.AMBIGUOUS) & ~(problem.seen & ~outlier)[:, -1]
+    return _result(problem, state, cov, singular, outlier, min_probability, ambiguous)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,13 +314,20 @@ def _without_one(problem: _Rows, state: FloatArray, plain: FloatArray, outlier_s
 
 
 def _result(
-    problem: _Rows, state: FloatArray, cov: FloatArray, singular: BoolArray, outlier: BoolArray, min_probability: float
+    problem: _Rows,
+    state: FloatArray,
+    cov: FloatArray,
+    singular: BoolArray,
+    outlier: BoolArray,
+    min_probability: float,
+    ambiguous: BoolArray,
 ) -> RobustFixes:
     left = problem.left(state)
     used = problem.seen & ~outlier
     chi2 = np.sum(np.where(used, problem.weight * left**2, 0.0), axis=1)
     dof = used.sum(axis=1) - 4
     status = np.full(len(state), FixStatus.OK, np.int8)
+    status[ambiguous] = FixStatus.AMBIGUOUS
     if min_probability > 0.0:
         status[(dof > 0) & (chdtrc(np.maximum(dof, 1), chi2) < min_probability)] = FixStatus.RESIDUAL
     status[singular] = FixStatus.SINGULAR
