@@ -187,7 +187,7 @@ def test_mirrors_among_level_transmitters_have_an_image_and_say_so(tmp_path: Pat
 
 
 def test_mirrors_among_nearly_level_transmitters_are_solved_from_both_sides(tmp_path: Path) -> None:
-    result = _as_measured(_among(2.0, 2.5), tmp_path, "nearly")
+    result = _as_measured(_among(0.5, 2.5), tmp_path, "nearly")
     found = evaluate(result)
     assert found.solved == 12
     assert found.ratio_to_bound < 1.0 + 4.5 / np.sqrt(4.0 * 12)
