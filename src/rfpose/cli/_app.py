@@ -86,13 +86,16 @@ class _StderrHandler(logging.Handler):
 
 @contextlib.contextmanager
 def _notes_to_stderr() -> Iterator[None]:
-    """While it lasts, warnings of the library appear on standard error."""
-    handler = _StderrHandler(level=logging.WARNING)
-    logger = logging.getLogger("rfpose")
+    """While it lasts, warnings of the library appear on standard error, and that it compiles."""
+    handler = _StderrHandler()
+    logger, compiler = logging.getLogger("rfpose"), logging.getLogger("rfpose.jit")
+    level = compiler.level
     logger.addHandler(handler)
+    compiler.setLevel(logging.INFO)
     try:
         yield
     finally:
+        compiler.setLevel(level)
         logger.removeHandler(handler)
 
 

@@ -15,13 +15,15 @@ from typing import Any, Protocol, TypeVar
 
 import click
 
-from rfpose.errors import InvalidInputError
+from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
 
 __all__ = [
     "Progress",
     "Session",
     "check_ending",
+    "check_scenario",
+    "check_there",
     "common_options",
     "emit_json",
     "examples",
@@ -140,6 +142,20 @@ def outputs(
 def when_written(*paths: Path) -> str:
     """Return what to say of an interruption that comes too late to prevent anything."""
     return f"interrupted when all was done: {', '.join(map(str, paths))} written"
+
+
+def check_there(*paths: Path | None) -> None:
+    """Refuse an input that is not there before anything is loaded for it."""
+    for path in paths:
+        if path is not None and not path.exists():
+            raise RecordingError(f"{path}: no such file or directory; check the path")
+
+
+def check_scenario(path: Path) -> None:
+    """Refuse a scenario that is missing or malformed before the compiled code is loaded that works on it."""
+    from rfpose.scenario import load_scenario
+
+    load_scenario(path)
 
 
 def check_ending(path: Path | None, *endings: str) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rfpose.cli._support import (
+    check_there,
     common_options,
     emit_json,
     examples,
@@ -70,6 +71,7 @@ def command(
     if dish == (target is not None):
         raise click.UsageError("give either --target E N U, or --dish")
     with outputs(output, inputs=[model], force=force), progress("Aiming"):
+        check_there(model)
         plans = _plans(model, target, start, hours, step, heliostats, site, n_next)
         if output is not None:
             from rfpose.pipeline.aim import write_commands

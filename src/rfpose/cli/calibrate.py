@@ -10,6 +10,7 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_there,
     common_options,
     emit_json,
     examples,
@@ -96,6 +97,7 @@ def command(
     check_ending(picture, ".png", ".pdf", ".svg")
     inputs = [directory, mounts, *radio, motors, camera, drone]
     with outputs(output, picture, inputs=inputs, force=force), progress("Fitting"):
+        check_there(*inputs)
         from rfpose.feedback.mount import PARAMETERS
         from rfpose.pipeline.calibrate import draw_errors, write_models
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rfpose.cli._support import (
+    check_there,
     common_options,
     emit_json,
     examples,
@@ -44,6 +45,7 @@ def command(result: Path, truth: Path | None, follow_links: bool) -> None:
     """
     from rfpose.errors import RecordingError
 
+    check_there(result, truth)
     with progress("Evaluating"):
         from rfpose.pipeline.result_file import read_result
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, follow_links_option, say, wants_json
+from rfpose.cli._support import check_there, common_options, emit_json, examples, follow_links_option, say, wants_json
 
 __all__ = ["command"]
 
@@ -28,6 +28,7 @@ __all__ = ["command"]
 @common_options
 def command(file: Path, follow_links: bool) -> None:
     """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound."""
+    check_there(file)
     from rfpose.pipeline.inspect import inspect_file
 
     found = inspect_file(file, follow_links=follow_links)

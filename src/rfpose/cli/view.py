@@ -8,6 +8,7 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_there,
     common_options,
     emit_json,
     examples,
@@ -75,6 +76,7 @@ def command(
         raise click.UsageError("--save needs a FILE to draw")
     check_ending(save, ".png", ".svg", ".html")
     with outputs(save, inputs=[file, scenario], force=force), progress("Drawing"):
+        check_there(file, scenario)
         from rfpose.viewer.app import check_installed
         from rfpose.viewer.export import export
 

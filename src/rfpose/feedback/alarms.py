@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import median_filter
-from scipy.stats import theilslopes
 
 from rfpose.checks import FloatArray, as_positive
 from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
@@ -170,6 +169,8 @@ def _drift(
     """Total change along a run, if it is sure and beyond one of the limits."""
     if len(part) < 10:
         return None
+    from scipy.stats import theilslopes  # takes a second to load, and only this needs it
+
     slope, _, low, high = theilslopes(part, alpha=0.997)
     total = float(slope) * (len(part) - 1)
     if abs(total) > limit and low * high > 0.0:

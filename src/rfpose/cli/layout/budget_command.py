@@ -10,6 +10,7 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_scenario,
     common_options,
     emit_json,
     examples,
@@ -79,6 +80,7 @@ def command(
     check_ending(picture, ".png", ".svg")
     claimed = outputs(output, picture, inputs=[scenario, field], force=force)
     with claimed, progress("Drawing") as on_progress:
+        check_scenario(scenario)
         from rfpose.pipeline.layout import budget_layout, draw_budget, write_budget_csv
 
         found = budget_layout(

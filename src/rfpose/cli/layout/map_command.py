@@ -10,6 +10,7 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_scenario,
     common_options,
     emit_json,
     examples,
@@ -70,6 +71,7 @@ def command(
         raise click.UsageError("--tower and --behind need --line-of-sight WIDTH HEIGHT, the size of the plates")
     check_ending(picture, ".png", ".svg")
     with outputs(picture, csv_path, inputs=[scenario, field], force=force), progress("Mapping"):
+        check_scenario(scenario)
         from rfpose.layout.sight import Plates, Tower
         from rfpose.pipeline.layout import Sight, draw_layout_map, map_layout, write_layout_csv
 

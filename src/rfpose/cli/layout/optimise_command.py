@@ -10,6 +10,7 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_scenario,
     common_options,
     emit_json,
     examples,
@@ -109,6 +110,7 @@ def command(
     check_ending(picture, ".png", ".svg")
     claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline"]], force=force)
     with claimed:
+        check_scenario(scenario)
         from rfpose.layout.optimise import Costs
 
         settings: dict[str, Any] = {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rfpose.cli._support import common_options, emit_json, examples, progress, say, table, wants_json
+from rfpose.cli._support import check_scenario, common_options, emit_json, examples, progress, say, table, wants_json
 
 __all__ = ["command"]
 
@@ -45,6 +45,7 @@ def command(
 ) -> None:
     """Choose the tones that reach an accuracy of the normals, with integers that are safe."""
     with progress("Searching"):
+        check_scenario(scenario)
         from rfpose.pipeline.layout.toning import design_site_tones
 
         found = design_site_tones(

@@ -14,7 +14,6 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc
-from scipy.stats import qmc
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
@@ -294,6 +293,8 @@ def _behind(places: FloatArray, pivot: FloatArray, rot: FloatArray, reflectors: 
 
 def turns() -> FloatArray:
     """Rotation vectors spread over a ball, small ones first; none at all is first of all."""
+    from scipy.stats import qmc  # takes a second to load, and only this needs it
+
     cube = 2.0 * qmc.Halton(3, scramble=False).random(_N_TURN) - 1.0
     length = np.linalg.norm(cube, axis=1)
     inside = length <= 1.0

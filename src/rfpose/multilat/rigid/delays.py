@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
@@ -115,7 +115,7 @@ def learn_delays(
         raise InvalidInputError(f"`observed` must have the shape of `clock_m`, {clock.shape}, got {seen_clock.shape}")
     blind = ~(seen_clock[..., :1] & seen_clock[..., 1:]).reshape(n_frame, n_mirror, -1)
     n_difference = len(to_difference)
-    limit = float(chi2.isf(_JUMP_PROBABILITY, n_difference))
+    limit = float(chdtri(n_difference, _JUMP_PROBABILITY))
     known = np.zeros(n_mirror, np.bool_)
     state, spread = np.zeros((n_mirror, n_difference)), np.zeros((n_mirror, n_difference, n_difference))
     seen_at = np.zeros(n_mirror)

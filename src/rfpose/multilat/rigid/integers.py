@@ -13,8 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erfc
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc, erfc
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
@@ -416,7 +415,7 @@ def _placed(poses: RigidPoses, rows: IntArray, other: RigidPoses) -> RigidPoses:
 def _is_unlikely(poses: RigidPoses) -> BoolArray:
     """Not solved, or with residuals that noise hardly makes."""
     with np.errstate(invalid="ignore"):
-        rare = chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)) < _UNLIKELY
+        rare = chdtrc(np.maximum(poses.dof, 1.0), poses.chi2) < _UNLIKELY
     return np.asarray(rare | (poses.status == RigidStatus.NOT_CONVERGED))
 
 

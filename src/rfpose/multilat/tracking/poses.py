@@ -7,7 +7,7 @@ from enum import IntEnum, IntFlag
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
@@ -243,7 +243,7 @@ def track_poses(
         how.rate_walk_radps_per_sqrt_s**2,
         how.pivot_walk_m_per_sqrt_s**2,
         how.rate_sigma_radps**2,
-        chi2.isf(how.gate_probability, [6, 3, 3]),
+        chdtri([6, 3, 3], how.gate_probability),
         float(how.max_coast_s),
         how.restart_after,
         float(delay_s),

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.dsp import Calibration, TonePhases
@@ -75,7 +75,7 @@ def pose_status(status: IntArray) -> IntArray:
 def residual_probability(poses: RigidPoses) -> FloatArray:
     """Return the probability of residuals as large as these or larger."""
     with np.errstate(invalid="ignore"):
-        return np.asarray(chi2_distribution.sf(poses.chi2, np.maximum(poses.dof, 1.0)))
+        return np.asarray(chdtrc(np.maximum(poses.dof, 1.0), poses.chi2))
 
 
 def as_protected(found: Found, missed: float) -> Found:
