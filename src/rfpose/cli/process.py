@@ -135,7 +135,7 @@ def command(
             ["receiver fixes", str(summary["fixes"]["solved"]), str(summary["fixes"]["failed"])],
         ],
     )
-    for what in ("poses", "fixes", "tones"):
+    for what in ("poses", "fixes", "transmitters"):
         for reason, count in summary[what]["reasons"].items():
             say(f"  {count} {what}: {reason}")
     for line in _findings(summary):

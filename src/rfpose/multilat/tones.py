@@ -90,6 +90,7 @@ def design_tones(
     n_difference: int = 1,
     share: Share = "index",
     speed_mps: float = SPEED_OF_LIGHT_MPS,
+    shown: tuple[float, str] = (1.0, "m"),
 ) -> ToneDesign:
     """Choose the tones that reach an accuracy with a wanted rate of success, in as little band as does it.
 
@@ -115,6 +116,8 @@ def design_tones(
         ``none``.
     speed_mps
         Of propagation [m/s].
+    shown
+        What the range noise is multiplied by in messages, and the unit that it then has: what was asked for.
 
     Raises
     ------
@@ -139,7 +142,8 @@ def design_tones(
     failure: InvalidInputError | GeometryError | None = None
     for n in range(1, (n_tone or MAX_TONE) + 1):
         try:
-            return _design(n, reach, sigma * n ** _NOISE_GROWS[share], wanted, success, band_hz, n_difference, speed)
+            growth = n ** _NOISE_GROWS[share]
+            return _design(n, reach, sigma * growth, wanted, success, band_hz, n_difference, speed, shown)
         except _TooFewTonesError as error:
             failure = InvalidInputError(str(error))
         except (GeometryError, InvalidInputError) as error:
@@ -163,7 +167,9 @@ def _design(
     band_hz: tuple[float, float],
     n_difference: int,
     speed: float,
+    shown: tuple[float, str],
 ) -> ToneDesign:
+    factor, unit = shown
     low, high = band_hz
     # λ/2 = reach + 6 · √2 · λσ/2π
     room = 0.5 - AMBIGUITY_MARGIN_SIGMA * math.sqrt(2.0) * sigma / (2.0 * math.pi)
@@ -180,15 +186,17 @@ def _design(
     alone = longest * sigma / (2.0 * math.pi)
     if n == 1 and alone > wanted:
         raise _TooFewTonesError(
-            f"one tone that spans the field gives {alone:.3g} m, wanted {wanted:.3g} m; allow more tones"
+            f"one tone that spans the field gives {factor * alone:.3g} {unit}, wanted {factor * wanted:.3g}; "
+            "allow more tones"
         )
     tones = np.array([longest]) if n == 1 else _least_band(longest, n, sigma, wanted)
     needed = speed / float(tones[-1])
     if needed > high * (1.0 + 1e-9):
         reached = ladder_sigma_m(np.append(tones[:-1], speed / high), sigma)[-1]
         raise InvalidInputError(
-            f"band too narrow: {wanted:.3g} m needs a tone of {needed / 1e6:.4g} MHz, the band ends at "
-            f"{high / 1e6:.4g} MHz, which gives {reached:.3g} m; widen it, lower the noise, or accept less"
+            f"band too narrow: {factor * wanted:.3g} {unit} needs a tone of {needed / 1e6:.4g} MHz, the band ends at "
+            f"{high / 1e6:.4g} MHz, which gives {factor * reached:.3g} {unit}; widen it, lower the noise, or accept "
+            "less"
         )
     risk = ladder_risk(tones, sigma, n_difference=n_difference)
     total = max(0.0, float(-np.expm1(np.log1p(-np.minimum(risk, 1.0 - 1e-16)).sum())))

@@ -178,9 +178,13 @@ def check_reflectors(scenario: Scenario, reflectors: tuple[Reflector, ...]) -> N
 
     Raises
     ------
+    ScenarioError
+        Carriers without a radio frequency.
     GeometryError
         Names the plane and what lies behind it.
     """
+    if reflectors:
+        scenario.need_rf_carriers("the model of reflections")
     standing = (
         ("transmitter", scenario.transmitter_ids, scenario.transmitter_enu_m),
         ("calibration receiver", tuple(r.id for r in scenario.calibration_receiver), scenario.calibration_enu_m),

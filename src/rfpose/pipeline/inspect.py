@@ -104,12 +104,9 @@ def _result(path: Path) -> dict[str, Any]:
 
 def _track(path: Path) -> dict[str, Any]:
     track = read_track(path)
-    times = (
-        [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[[0, -1]]] if len(track.unix_s) else []
-    )
-    problems = [
-        f"{name}: no error was scored" for name, m in track.methods.items() if m.summary["normal_mrad"]["rms"] is None
-    ]
+    times = [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[:: max(len(track.unix_s) - 1, 1)]]
+    unscored = [name for name, method in track.methods.items() if method.summary["normal_mrad"]["rms"] is None]
+    problems = [f"{name}: no error was scored; its mirrors were never on the receiver" for name in unscored]
     return {
         "scenario": track.scenario.name,
         "settings": dict(track.settings),

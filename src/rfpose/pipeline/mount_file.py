@@ -24,14 +24,13 @@ from rfpose.feedback.mount import Actuator, Mount
 from rfpose.feedback.sun import Site, site_from_degrees
 from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
-from rfpose.kinds import kind_of
+from rfpose.kinds import kind_of, told_kind
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "is_model", "read_models", "write_model_file"]
 
 MODEL_FORMAT = "rfpose-mount"
 MODEL_VERSION = 1
-_MODEL_BYTES = 2**28
-"""Of ten thousand calibrated mounts with their covariances."""
+_LARGEST_BYTES = 2**28  # ten thousand calibrated heliostats are 100 MB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,6 +200,8 @@ def read_models(path: str | Path) -> MountFile:
         Missing, not of this format or of a newer version, or something in it is not as it must be: the place is named.
     """
     path = Path(path)
+    if instead := told_kind(path, wanted="model"):
+        raise RecordingError(f"{path}: no {MODEL_FORMAT} file, but {instead}; give what `rfpose calibrate -o` wrote")
     content = _load(path)
     if content.get("format") != MODEL_FORMAT:
         raise RecordingError(f"{path}: is no {MODEL_FORMAT} file; give what `rfpose calibrate -o` wrote")
@@ -227,11 +228,7 @@ def read_models(path: str | Path) -> MountFile:
 
 def _load(path: Path) -> dict[str, Any]:
     load = load_toml if path.suffix == ".toml" else load_json
-    content = load(
-        path,
-        limit=_MODEL_BYTES,
-        remedy="mounts are JSON or TOML by the file's ending: give what `rfpose calibrate -o` wrote",
-    )
+    content = load(path, limit=_LARGEST_BYTES, remedy="give what `rfpose calibrate -o` wrote, .json or .toml")
     if not isinstance(content, dict):
         raise RecordingError(f"{path}: must hold one object, got a {type(content).__name__}")
     return content

@@ -56,7 +56,8 @@ def summarise(result: Result) -> dict[str, Any]:
     parts = {
         "poses": (result.poses.status, PoseStatus),
         "fixes": (result.fixes.status[:, is_mirror], FixStatus),
-        "tones": (result.tones.status, LineStatus),
+        "transmitters": (result.tones.status, LineStatus),
+        "tones": (_status_of_tones(result), LineStatus),
     }
     summary: dict[str, Any] = {
         "frames": len(result.frame_start_index),
@@ -81,6 +82,14 @@ def summarise(result: Result) -> dict[str, Any]:
     if result.filtered is not None:
         summary["filtered"] = _summary_of_filtered(result.filtered)
     return summary
+
+
+def _status_of_tones(result: Result) -> npt.NDArray[Any]:
+    """(frame, receiver, transmitter, tone) what is wrong with each; a weak tone may fail beside a good one."""
+    status = np.repeat(result.tones.status[..., None], result.tones.phase_rad.shape[-1], axis=-1)
+    missing = (status == 0) & ~np.isfinite(result.tones.phase_rad)
+    measured = (status == LineStatus.WEAK) & np.isfinite(result.tones.phase_rad)
+    return np.where(missing, LineStatus.WEAK, np.where(measured, 0, status))
 
 
 def _summary_of_integers(result: Result) -> dict[str, Any]:

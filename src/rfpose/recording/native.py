@@ -14,6 +14,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.foreign import exact_rate
+from rfpose.kinds import told_kind
 from rfpose.recording import keys
 from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
 from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
@@ -112,6 +113,8 @@ def _open_hdf5(path: Path) -> h5py.File:
         if not h5py.is_hdf5(path):
             with path.open("rb"):  # says so when it is permission that lacks
                 pass
+            if instead := told_kind(path, wanted="recording"):
+                raise RecordingError(f"{path}: no recording, but {instead}; give what was recorded or simulated")
             raise RecordingError(
                 f"{path}: not an HDF5 file; give an rfpose-iq file, a Digital RF directory or a SigMF recording"
             )
@@ -157,6 +160,8 @@ class _Fields:
                 raise RecordingError(
                     f"{self._path}: this is one file of a Digital RF recording; give the directory above its channels"
                 )
+            if instead := told_kind(self._path, wanted="recording"):
+                raise RecordingError(f"{self._path}: no recording, but {instead}; give what was recorded or simulated")
             raise RecordingError(
                 f"{self._path}: an HDF5 file of another format (attribute `{keys.FORMAT}` of `/` must be "
                 f"{keys.FORMAT_NAME!r}, is {found!r:.60}); give an rfpose-iq file or convert it with `rfpose convert`"

@@ -51,9 +51,15 @@ def parse_scenario(text: str, *, source: str = "scenario", scale: float | None =
             raise ScenarioError(f"`scale` must be a number, got {file_scale!r}")
         _fill_heliostats(data)
         scenario = Scenario.model_validate(data)
-        return scenario.scaled(float(file_scale if scale is None else scale))
     except ValidationError as error:
         raise ScenarioError(f"{source}: {_in_words(error)}") from error
+    except ScenarioError as error:
+        raise ScenarioError(f"{source}: {error}") from error
+    factor = float(file_scale if scale is None else scale)
+    try:
+        return scenario.scaled(factor)
+    except ValidationError as error:
+        raise ScenarioError(f"{source}: with `scale` {factor:g}: {_in_words(error)}") from error
     except ScenarioError as error:
         raise ScenarioError(f"{source}: {error}") from error
 
@@ -74,7 +80,10 @@ def check_scenario(data: Mapping[str, Any]) -> Scenario:
 
 def _fill_heliostats(data: dict[str, Any]) -> None:
     """Give each heliostat what the ``[mirror]`` table says unless it says so itself, and names its receivers."""
-    mirror = Mirror.model_validate(data.pop("mirror", {})).model_dump(exclude_none=True)
+    try:
+        mirror = Mirror.model_validate(data.pop("mirror", {})).model_dump(exclude_none=True)
+    except ValidationError as error:
+        raise ScenarioError(_in_words(error, "mirror")) from error
     heliostats = data.get("heliostat", [])
     if not isinstance(heliostats, list):
         return
@@ -88,12 +97,11 @@ def _fill_heliostats(data: dict[str, Any]) -> None:
             heliostat.setdefault("receiver_ids", [f"{heliostat['id']}_r{k}" for k in range(len(places))])
 
 
-def _in_words(error: ValidationError) -> str:
-    """Put pydantic's first complaint as ``place: what is wrong``."""
+def _in_words(error: ValidationError, place: str = "") -> str:
+    """Put pydantic's first complaint as ``place: what is wrong``; places lie within ``place``."""
     complaints = error.errors()
     # a misspelt key is also a missing one; the misspelling is the better message
     first = min(complaints, key=lambda c: c["type"] != "extra_forbidden")
-    place = ""
     for part in first["loc"]:
         place += f"[{part}]" if isinstance(part, int) else f".{part}" if place else str(part)
     if first["type"] == "extra_forbidden":

@@ -146,6 +146,21 @@ class Scenario(Record):
         start = sum(len(h.receiver_ids) for h in self.heliostat[:i_heliostat])
         return slice(start, start + len(self.heliostat[i_heliostat].receiver_ids))
 
+    def need_rf_carriers(self, what: str) -> None:
+        """Refuse what cannot be told without carriers at radio frequencies above zero.
+
+        Raises
+        ------
+        ScenarioError
+            Some are not; says for ``what`` they are needed.
+        """
+        if not self.has_rf_carriers:
+            raise ScenarioError(
+                f"{what} needs carriers whose radio frequencies are above zero, and that of transmitter "
+                f"`{self.transmitter_ids[int(np.argmin(self.carrier_rf_hz))]}` is {self.carrier_rf_hz.min():g} Hz; set "
+                "`radio.centre_frequency_hz`, or leave reflections out"
+            )
+
     def compares_carriers(self, heliostat: Heliostat) -> bool:
         """Whether the carriers' own phases are compared between a heliostat's receivers.
 

@@ -102,7 +102,7 @@ def _result_tables(result: Result) -> list[str]:
     summary = summarise(result)
     rows = [
         [name, str(part["solved"]), str(part["failed"]), "; ".join(f"{n} × {r}" for r, n in part["reasons"].items())]
-        for name, part in ((key, summary[key]) for key in ("poses", "fixes", "tones"))
+        for name, part in ((key, summary[key]) for key in ("poses", "fixes", "transmitters", "tones"))
     ]
     counts = {key: summary[key] for key in ("frames", "heliostats", "receivers", "estimator", "pose")}
     parts = ["<h2>What was measured</h2>", _facts(counts), _table(("", "solved", "failed", "reasons"), rows)]

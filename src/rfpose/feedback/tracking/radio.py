@@ -71,7 +71,7 @@ class RadioModel:
     Raises
     ------
     ScenarioError
-        No heliostat that says where receivers are.
+        No heliostat that says where receivers are; a ground that reflects carriers without a radio frequency.
     GeometryError
         Transmitters that fix no position.
     """
@@ -87,6 +87,8 @@ class RadioModel:
         self._noise: Noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
         ground = scenario.simulation.ground
         self._handling = "none" if ground is None else scenario.tracking.radio.ground
+        if self._handling != "none":
+            scenario.need_rf_carriers("[simulation] `ground`")
         self._nearest = self._neighbours()
         self.excess = 1.0
         """How much larger the noise is for estimating the reflection too."""

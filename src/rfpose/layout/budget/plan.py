@@ -212,6 +212,8 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
 
     Raises
     ------
+    ScenarioError
+        A ground that reflects carriers without a radio frequency.
     InvalidInputError
         Unknown ``pose``; ground known or estimated with separately located receivers.
     GeometryError
@@ -220,6 +222,8 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
     if pose not in ("rigid", "independent"):
         raise InvalidInputError(f"`pose` must be rigid or independent, got {pose!r}")
     transmitter = check_site(scenario.transmitter_enu_m)
+    if scenario.simulation.ground is not None:
+        scenario.need_rf_carriers("[simulation] `ground`")
     check_unambiguous(transmitter, scenario.wavelength_m)
     estimator = _estimator(scenario, pose)
     noise = noise_of(scenario)

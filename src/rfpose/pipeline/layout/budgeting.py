@@ -116,7 +116,7 @@ def budget_layout(
     studied = postures_of(scenario, postures or Postures(), scenario_path)
     try:
         plan = make_plan(scenario, stacked([p.mirrors for p in studied]), pose=pose)
-    except (GeometryError, InvalidInputError) as error:
+    except (GeometryError, InvalidInputError, ScenarioError) as error:
         raise ScenarioError(f"{scenario_path}: {error}") from error
     found = error_budget(plan, n_draw=n_draw, seed=seed, aim_enu_m=scenario.site.aim_enu_m, progress=on_progress)
     blind = np.flatnonzero(~np.isfinite(found.whole.normal_rad))

@@ -265,7 +265,7 @@ def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | 
         data["simulation"] = {**data.get("simulation", {}), "tone_snr_db": tone_snr_db}
     try:
         return noise_bound(make_plan(check_scenario(data), posture.mirrors))
-    except (GeometryError, InvalidInputError) as error:
+    except (GeometryError, InvalidInputError, ScenarioError) as error:
         raise ScenarioError(f"{path}: {error}") from error
 
 

@@ -13,7 +13,7 @@ from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS, Noise
 from rfpose.multilat.tones import Share, ToneDesign, design_tones
-from rfpose.scenario import load_scenario
+from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["SiteTones", "design_site_tones"]
 
@@ -54,6 +54,23 @@ class SiteTones:
             "step_risk": self.tones.step_risk,
             "wrong_risk": self.tones.wrong_risk,
         }
+
+
+def _by_carriers(scenario: Scenario, accuracy_mrad: float) -> str:
+    """Say where the scenario's own solver, which compares carriers besides, reaches the accuracy with other tones."""
+    if not any(scenario.compares_carriers(h) for h in scenario.heliostat):
+        return ""
+    try:
+        bound = maps.study_of(scenario, maps.SCENARIO).bound(maps.mirrors_of(scenario))
+    except (GeometryError, InvalidInputError):
+        return ""
+    reached = 1e3 * float(np.sqrt(np.mean(bound**2)))
+    if not reached <= accuracy_mrad:
+        return ""
+    return (
+        f"; or leave it to the carriers, which `rfpose process` compares besides tones: {reached:.3g} mrad with the "
+        "scenario's own tones (`rfpose layout map --estimator scenario`), where their whole wavelengths are found"
+    )
 
 
 def design_site_tones(
@@ -117,9 +134,10 @@ def design_site_tones(
             n_difference=mirrors.receiver_mirror_m.shape[1] * (len(transmitter) - 1),
             share=share,
             speed_mps=scenario.radio.propagation_speed_mps,
+            shown=(1e3 * rad_per_m, "mrad of the normal"),
         )
     except (GeometryError, InvalidInputError) as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
+        raise ScenarioError(f"{scenario_path}: {error}{_by_carriers(scenario, accuracy_mrad)}") from error
     index = scenario.tone[0].modulation_index
     return SiteTones(
         scenario=scenario.name,
