@@ -81,7 +81,7 @@ def test_other_hdf5(tmp_path):
 def test_result_file_is_called_one(tmp_path):
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.attrs["format"] = "rfpose-result"
-    with pytest.raises(RecordingError, match="this is a result of `rfpose process`, not a recording"):
+    with pytest.raises(RecordingError, match="no recording, but a result of `rfpose process`, which `rfpose evaluate`"):
         open_recording(tmp_path / "x.h5")
 
 

@@ -40,7 +40,8 @@ def test_shipped_scenario(path: Path, tmp_path: Path) -> None:
         assert opened.truth is not None
         starts = [int(opened.blocks(name)[0, 0]) for name in opened.receiver_ids]
         assert starts == [data["simulation"]["start_unix_s"] * opened.sample_rate] * len(starts)
-    done = run("process", recording, "-o", result, "--estimator", "correlator")
+    reflects = ["--reflection", "estimate"] if "ground" in data["simulation"] else []
+    done = run("process", recording, "-o", result, "--estimator", "correlator", *reflects)
     n_line = 2 * len(opened.receiver_ids) * len(data["transmitter"])
     assert done["transmitters"]["solved"] + done["transmitters"]["failed"] == n_line
     assert done["tones"]["solved"] + done["tones"]["failed"] == n_line * len(data["tone"])

@@ -6,7 +6,6 @@ from typing import Final
 
 FORMAT_NAME: Final = "rfpose-iq"
 FORMAT_VERSION: Final = 1
-RESULT_FORMAT_NAME: Final = "rfpose-result"
 
 # attributes of the root group
 FORMAT: Final = "format"

@@ -150,11 +150,6 @@ class _Fields:
         """Refuse another format's HDF5, and a version this program does not know."""
         found = self._file.attrs.get(keys.FORMAT)
         found = found if isinstance(found, str) else None
-        if found == keys.RESULT_FORMAT_NAME:
-            raise RecordingError(
-                f"{self._path}: this is a result of `rfpose process`, not a recording; use `rfpose evaluate` or "
-                "`rfpose info` on it, or give the recording it came from"
-            )
         if found != keys.FORMAT_NAME:
             if self._file.get("rf_data", getlink=True) is not None or "digital_rf_version" in self._file.attrs:
                 raise RecordingError(

@@ -1,0 +1,160 @@
+"""Each command that is given another kind of file says what it is and which command takes it; info knows them all."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rfpose.cli._app import app
+from rfpose.errors import install_remedy
+from rfpose.kinds import kind_of
+from rfpose.pipeline.mount_file import MODEL_FORMAT
+from rfpose.pipeline.process import process
+from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.track import track
+from rfpose.scenario import check_scenario, load_scenario
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+
+
+def run(*arguments: object) -> tuple[int, str, str]:
+    done = CliRunner().invoke(app, [str(a) for a in arguments])
+    return done.exit_code, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("kinds")
+    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
+    data["heliostat"], data["radio"]["frame_samples"] = data["heliostat"][:2], 8000
+    data["tone"] = [{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}]
+    data["tracking"] = {"first_hour": 11.0, "last_hour": 11.2, "settle_s": 60.0, "date": "2026-03-20"}
+    data["site"] |= {"latitude_deg": -33.9, "longitude_deg": 18.9}
+    names = {"recording": "rec.h5", "result": "result.h5", "track": "run.h5", "scenario": "site.toml"}
+    paths = {kind: folder / name for kind, name in names.items()}
+    paths["scenario"].write_text(check_scenario(data).to_toml())
+    simulate_recording(paths["scenario"], paths["recording"], seed=1)
+    process(paths["recording"], paths["result"], estimator="correlator")
+    track(paths["scenario"], paths["track"], methods=("open-loop", "encoder"))
+    for name, text in (
+        ("mounts.toml", f'format = "{MODEL_FORMAT}"\nversion = 1\n[heliostat.H1]\npivot_enu_m = [1.0, 2.0, 3.0]\n'),
+        (
+            "mounts.json",
+            json.dumps({"format": MODEL_FORMAT, "version": 1, "heliostat": {"H1": {"pivot_enu_m": [1, 2, 3]}}}),
+        ),
+        ("truth.json", json.dumps({"heliostats": [{"id": "H01", "normal_enu": [0, 0, 1], "receivers_enu_m": []}]})),
+    ):
+        (folder / name).write_text(text)
+        paths[name] = folder / name
+    return paths
+
+
+def test_kinds_are_told_apart(files: dict[str, Path], tmp_path: Path) -> None:
+    expected = {"mounts.toml": "model", "mounts.json": "model", "truth.json": "truth"}
+    assert {name: kind_of(path) for name, path in files.items()} == {name: expected.get(name, name) for name in files}
+    other = tmp_path / "other.toml"
+    other.write_text("[tool]\nname = 'x'\n")
+    assert kind_of(other) is None
+    assert kind_of(tmp_path) is None
+    assert kind_of(tmp_path / "missing") is None
+
+
+@pytest.mark.parametrize(
+    ("command", "others"),
+    [
+        (("evaluate", "FILE"), ("scenario", "recording", "track", "mounts.toml")),
+        (("simulate", "FILE", "-o", "OUT"), ("recording", "result", "track", "mounts.toml", "truth.json")),
+        (("process", "FILE", "-o", "OUT"), ("scenario", "result", "track", "mounts.json")),
+        (("layout", "map", "FILE"), ("result", "track", "mounts.toml")),
+        (("layout", "budget", "FILE"), ("recording",)),
+        (("layout", "tones", "FILE", "--accuracy-mrad", "1"), ("recording",)),
+        (("layout", "optimise", "FILE"), ("recording",)),
+        (("track", "FILE", "-o", "OUT"), ("result", "mounts.toml")),
+        (("convert", "FILE", "-o", "OUT"), ("scenario", "result")),
+        (("aim", "FILE", "--dish", "--start", "2026-06-21T06:00Z"), ("scenario", "result", "truth.json")),
+    ],
+    ids=lambda value: "-".join(value[:2]) if isinstance(value, tuple) else str(value),
+)
+def test_another_kind_is_named_with_who_takes_it(files, tmp_path, command, others) -> None:
+    words = {
+        "scenario": "a scenario",
+        "recording": "a recording",
+        "result": "a result",
+        "track": "a run of `rfpose track`",
+        "mounts.toml": "a file of mounts",
+        "mounts.json": "a file of mounts",
+        "truth.json": "a truth",
+    }
+    for other in others:
+        path = files[other]
+        arguments = [path if a == "FILE" else tmp_path / "out.h5" if a == "OUT" else a for a in command]
+        code, _, error = run(*arguments)
+        assert code == 3, (other, error)
+        assert str(path) in error
+        assert f"but {words[other]}" in error, error
+        assert "take" in error
+        assert len(error.strip().splitlines()) == 1
+        assert not (tmp_path / "out.h5").exists()
+
+
+def test_info_tells_a_tracking_run(files: dict[str, Path]) -> None:
+    code, out, _ = run("info", files["track"], "--json")
+    told = json.loads(out)
+    assert code == 0
+    assert (told["kind"], told["sound"], told["heliostats"], told["days"]) == ("track", True, 2, ["2026-03-20"])
+    assert told["first_instant_utc"].startswith("2026-03-20T")
+    assert told["first_instant_utc"] < told["last_instant_utc"]
+    assert set(told["methods"]) == {"open-loop", "encoder"}
+    assert all(method["rms_mrad"] > 0.0 for method in told["methods"].values())
+    for name in ("mounts.toml", "mounts.json"):
+        assert json.loads(run("info", files[name], "--json")[1])["kind"] == "model"
+    code, _, error = run("info", files["truth.json"])
+    assert code == 3
+    assert "rfpose evaluate --truth" in error
+
+
+def test_tones_and_transmitters_are_counted_apart(files: dict[str, Path]) -> None:
+    told = json.loads(run("info", files["result"], "--json")[1])
+    # 5 frames, 2 mirrors of 3 receivers and one for calibration, 10 transmitters, 2 tones
+    assert told["transmitters"]["solved"] + told["transmitters"]["failed"] == 5 * 7 * 10
+    assert told["tones"]["solved"] == 5 * 7 * 10 * 2
+
+
+def test_tones_speak_in_the_unit_that_was_asked_for(files: dict[str, Path]) -> None:
+    code, _, error = run("layout", "tones", files["scenario"], "--accuracy-mrad", "0.5")
+    assert code == 3
+    assert "band too narrow: 0.5 mrad of the normal needs a tone of" in error
+    assert "leave it to the carriers" in error
+    assert "rfpose layout map --estimator scenario" in error
+    code, _, error = run("layout", "tones", files["scenario"], "--accuracy-mrad", "0.5", "-n", "1")
+    assert "wanted 0.5; allow more tones" in error
+    code, _, error = run("layout", "tones", files["scenario"], "--accuracy-mrad", "1e-9")
+    assert "carriers" not in error
+
+
+def test_extras_are_installed_from_a_checkout_too() -> None:
+    assert install_remedy("gui") == "in a checkout of rfpose: `pip install '.[gui]'`; else: `pip install 'rfpose[gui]'`"
+    for path in (DATA.parent / "src").rglob("*.py"):
+        if path.name != "errors.py":
+            assert "rfpose[" not in path.read_text(encoding="utf-8"), f"{path}: use install_remedy"
+
+
+def test_reflections_without_radio_frequencies_are_refused_in_the_users_words(tmp_path: Path) -> None:
+    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
+    data["heliostat"], data["radio"]["frame_samples"] = data["heliostat"][:2], 8000
+    data["radio"]["centre_frequency_hz"] = 0.0
+    data["simulation"]["ground"] = {"coefficient": [-0.3, 0.1]}
+    data["reflection"] = {"model": "estimate"}
+    data["site"] |= {"latitude_deg": -33.9, "longitude_deg": 18.9}
+    site = tmp_path / "site.toml"
+    site.write_text(check_scenario(data).to_toml())
+    simulate_recording(site, tmp_path / "rec.h5", seed=1)
+    for command in (
+        ("layout", "budget", site),
+        ("process", tmp_path / "rec.h5", "-o", tmp_path / "out.h5"),
+        ("track", site, "-o", tmp_path / "out.h5", "--methods", "radio"),
+    ):
+        code, _, error = run(*command)
+        assert code == 3
+        assert "transmitter `T1` is -1.8e+07 Hz; set `radio.centre_frequency_hz`" in error, error
