@@ -202,8 +202,10 @@ class Claim:
             with contextlib.suppress(OSError):
                 if self._taken:
                     remove(output.part)
-                # what a dead job noted is for one like it, and so is what this one noted if it stuck halfway
-                if not (self._halfway and output is self._outputs[0]) and (self._taken or not _read_note(output.lock)):
+                # what a dead job published is noted for one like it, and so it is if this one stuck halfway
+                if not (self._halfway and output is self._outputs[0]) and (
+                    self._taken or "published" not in _read_note(output.lock)
+                ):
                     output.lock_path.unlink()
             output.lock.close()
             output.lock = None
