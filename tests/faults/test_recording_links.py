@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rfpose.cli import app
+from rfpose.cli._app import app
 from rfpose.errors import RecordingError
 from rfpose.recording import RecordingWriter, convert, describe, open_recording
 

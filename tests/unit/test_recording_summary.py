@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rfpose.cli import app
+from rfpose.cli._app import app
 from rfpose.errors import ScenarioError
 from rfpose.recording import RecordingWriter, check_against, describe, open_recording
 from rfpose.scenario import load_scenario
