@@ -22,6 +22,7 @@ Side = Literal["below", "above"] | None
 """Of the transmitters' plane."""
 
 IntArray = npt.NDArray[np.int16]
+IndexArray = npt.NDArray[np.intp]
 StatusArray = npt.NDArray[np.int8]
 
 # Steps below this many standard deviations end the iteration; what then remains is far smaller still.
@@ -40,7 +41,7 @@ DECISIVE_CHI2 = 2.0 * np.log(1e4)
 APART_SIGMA = 3.0
 # How much less than at the mirror image itself chi-squared may be where a solution is found nearby: by how far that
 # lies above what decides, a row needs no second start.
-IMAGE_MARGIN = 1e4
+IMAGE_MARGIN = 100.0
 # A fix whose position RMS exceeds this part of the transmitters' extent (RMS about their centroid) is not solved:
 # what is known of it is no straight line any more, and its covariance says little.
 MAX_SIGMA_OF_EXTENT = 0.25
@@ -214,7 +215,8 @@ def locate(
     if start is None:
         _restart(problem, ranges, weight, result)
         ambiguous = _choose_side(problem, ranges, weight, result, known)
-    _judge(result, problem, max_dop, min_probability, ambiguous)
+    largest_sigma_m = scale / np.sqrt(np.nanmin(weight, initial=np.inf))
+    _judge(result, problem, max_dop, min_probability, ambiguous, largest_sigma_m)
     return Fixes(**{name: read_only(array) for name, array in result.items()})
 
 
@@ -330,7 +332,8 @@ class _Problem:
     def height(self, position_enu_m: FloatArray) -> FloatArray:
         """Height above the transmitters' plane [m]."""
         up = self.axes()[-1]
-        return np.asarray(position_enu_m @ up - self.centre[: len(up)] @ up)
+        # no BLAS: its threads cost more than so little work
+        return np.asarray(np.einsum("na,a->n", position_enu_m, up) - self.centre[: len(up)] @ up)
 
     def mirrored(self, position_enu_m: FloatArray) -> FloatArray:
         """Positions mirrored in the transmitters' plane; a NaN becomes their centroid."""
@@ -377,22 +380,11 @@ def _choose_side(
     have two solutions that fit alike.
     """
     ambiguous = np.zeros(len(ranges), np.bool_)
-    solved = np.flatnonzero(result["status"] == FixStatus.OK)
-    if not solved.size:
-        return ambiguous
     place = result["position_enu_m"]
-    image = np.full(place.shape, np.nan)
-    seen = np.isfinite(result["residual_m"])
-    for pattern, rows in _patterns(seen, solved):
-        at = rows[_has_image(problem.transmitter[pattern], place[rows], _rows_of(weight, rows)[:, pattern])]
-        image[at] = _Plane.of(problem.transmitter[pattern]).mirrored(place[at])
-    wrong = solved[known[solved] * problem.height(place[solved]) < 0.0]
-    wrong = wrong[np.isnan(image[wrong, 0])]
-    image[wrong] = problem.mirrored(place[wrong])
-    rows = np.flatnonzero(np.isfinite(image[:, 0]))
+    rows, image = _images(problem, weight, result, known)
     if not rows.size:
         return ambiguous
-    again = problem.solve(ranges[rows], _rows_of(weight, rows), image[rows], relax=RESTART_RELAX)
+    again = problem.solve(ranges[rows], _rows_of(weight, rows), image, relax=RESTART_RELAX)
     here, there = place[rows], again["position_enu_m"]
     apart = here - there
     with np.errstate(invalid="ignore"):
@@ -414,19 +406,44 @@ def _choose_side(
     return ambiguous
 
 
-def _rows_of(weight: FloatArray, rows: npt.NDArray[np.intp]) -> FloatArray:
+def _rows_of(weight: FloatArray, rows: IndexArray) -> FloatArray:
     """Weights of some rows; one row stands for all."""
     return weight if len(weight) == 1 else weight[rows]
 
 
-def _patterns(
-    seen: npt.NDArray[np.bool_], rows: npt.NDArray[np.intp]
-) -> Iterator[tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]]:
-    """Sort rows by which transmitters they received."""
-    if seen[rows].all():
-        yield seen[rows[0]], rows
+def _images(
+    problem: _Problem, weight: FloatArray, result: dict[str, npt.NDArray[Any]], known: FloatArray
+) -> tuple[IndexArray, FloatArray]:
+    """Rows that may have a second solution, or lie on the wrong side, and the mirror image of each."""
+    place, ok = result["position_enu_m"], result["status"] == FixStatus.OK
+    height = problem.height(place)
+    found, images = [np.zeros(0, np.intp)], [place[:0]]
+    for pattern, rows in _patterns(result):
+        plane = _Plane.of(problem.transmitter[pattern])
+        here = place if rows is None else place[rows]
+        info = (weight if len(weight) == 1 or rows is None else weight[rows])[:, pattern] / problem.scale**2
+        at = plane.near(height if rows is None else plane.height(here), here, problem.transmitter[pattern], info)
+        at = at if rows is None else rows[at]
+        found.append(at[ok[at]])
+        images.append(plane.mirrored(place[found[-1]]))
+    if known.any():
+        wrong = np.flatnonzero(ok & (known * height < 0.0))
+        found.append(np.setdiff1d(wrong, np.concatenate(found), assume_unique=True))
+        images.append(problem.mirrored(place[found[-1]]))
+    return np.concatenate(found), np.concatenate(images)
+
+
+def _patterns(result: dict[str, npt.NDArray[Any]]) -> Iterator[tuple[npt.NDArray[np.bool_], IndexArray | None]]:
+    """Sort solved rows by which transmitters they received; None stands for all rows there are."""
+    residual, status = result["residual_m"], result["status"]
+    if not len(residual):
         return
-    patterns, pattern = np.unique(seen[rows], axis=0, return_inverse=True)
+    if np.all(result["n_transmitter"] == residual.shape[1]):
+        yield np.ones(residual.shape[1], np.bool_), None
+        return
+    rows = np.flatnonzero(status == FixStatus.OK)
+    seen = np.isfinite(residual[rows])
+    patterns, pattern = np.unique(seen, axis=0, return_inverse=True)
     for k, received in enumerate(patterns):
         yield received, rows[pattern.reshape(-1) == k]
 
@@ -444,25 +461,33 @@ class _Plane:
         return cls(middle, np.linalg.svd(transmitter - middle, full_matrices=True)[2][-1])
 
     def height(self, place: FloatArray) -> FloatArray:
-        return np.asarray((place - self.point) @ self.normal)
+        return np.asarray(np.einsum("na,a->n", place, self.normal) - self.point @ self.normal)
 
     def mirrored(self, place: FloatArray) -> FloatArray:
         return np.asarray(place - 2.0 * self.height(place)[:, None] * self.normal)
 
+    def near(self, height: FloatArray, place: FloatArray, transmitter: FloatArray, info: FloatArray) -> IndexArray:
+        """Tell which places, at heights above the plane, could have a second solution beyond it.
 
-def _has_image(transmitter: FloatArray, place: FloatArray, weight: FloatArray) -> npt.NDArray[np.bool_]:
-    """Tell which rows could have a second solution beyond the transmitters' plane.
-
-    A transmitter δ off the plane, d away, is 2hδ/d farther from or nearer to the image of a place at height h. Where
-    the sum of squares of that, in standard deviations, is beyond all that could decide, there is no need to look.
-    """
-    plane = _Plane.of(transmitter)
-    off = plane.height(transmitter)
-    reach = np.linalg.norm(place - plane.point, axis=1) + np.linalg.norm(transmitter - plane.point, axis=1).max()
-    # weights are in units of the transmitters' extent, as the lengths here are relative
-    relative = weight @ off**2 if len(weight) > 1 else np.full(1, float(weight[0] @ off**2))
-    sum_of_squares = (2.0 * plane.height(place) / reach) ** 2 * relative
-    return np.asarray(sum_of_squares < IMAGE_MARGIN * DECISIVE_CHI2)
+        A transmitter δ off the plane, d away, is 2hδ/d farther from or nearer to the image of a place at height h.
+        Where the sum of squares of that, in standard deviations, is beyond all that could decide, there is no need to
+        look. ``info`` is 1/σ², one row for all or one a place. With one transmitter more than it takes, two places far
+        from being images can fit alike: then all are looked at.
+        """
+        if len(transmitter) == transmitter.shape[1] + 2:
+            return np.flatnonzero(np.isfinite(height))
+        relative = info @ self.height(transmitter) ** 2
+        width = float(np.linalg.norm(transmitter - self.point, axis=1).max())
+        enough = IMAGE_MARGIN * DECISIVE_CHI2 / 4.0
+        with np.errstate(invalid="ignore"):
+            # one reach for all tells of most rows that there is no need; the largest of all is quick to have
+            farthest = np.abs(place).max(initial=0.0)
+            farthest = farthest if np.isfinite(farthest) else np.nanmax(np.abs(place), initial=0.0)
+            reach = 2.0 * farthest + float(np.linalg.norm(self.point)) + width
+            some = np.flatnonzero(np.abs(height) < reach * np.sqrt(enough / np.maximum(relative, 1e-300)))
+            own = relative if len(relative) == 1 else relative[some]
+            reach_of = np.linalg.norm(place[some] - self.point, axis=1) + width
+            return np.asarray(some[height[some] ** 2 * own < enough * reach_of**2])
 
 
 def _chi2_limit(n_transmitter: IntArray, n_axis: int, probability: float) -> FloatArray:
@@ -477,6 +502,7 @@ def _judge(
     max_dop: float,
     min_probability: float,
     ambiguous: npt.NDArray[np.bool_],
+    largest_sigma_m: float,
 ) -> None:
     """Mark solved rows whose geometry is weak (and blank them), and those not to be relied on."""
     status = result["status"]
@@ -487,6 +513,9 @@ def _judge(
     if min_probability > 0.0:
         limit = _chi2_limit(result["n_transmitter"], result["position_enu_m"].shape[1], min_probability)
         status[(status == FixStatus.OK) & (result["chi2"] > limit)] = FixStatus.RESIDUAL
-    variance = np.trace(result["cov_enu_m2"], axis1=1, axis2=2)
-    status[(status == FixStatus.OK) & (variance > (MAX_SIGMA_OF_EXTENT * problem.scale) ** 2)] = FixStatus.UNCERTAIN
+    limit_m = MAX_SIGMA_OF_EXTENT * problem.scale
+    # no fix is worse than its dilution makes of the poorest range
+    some = np.flatnonzero((status == FixStatus.OK) & (result["dop"] * largest_sigma_m > limit_m))
+    vague = np.einsum("naa->n", result["cov_enu_m2"][some]) > limit_m**2
+    status[some[vague]] = FixStatus.UNCERTAIN
     status[(status == FixStatus.OK) & ambiguous] = FixStatus.AMBIGUOUS
