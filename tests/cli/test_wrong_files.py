@@ -158,3 +158,28 @@ def test_reflections_without_radio_frequencies_are_refused_in_the_users_words(tm
         code, _, error = run(*command)
         assert code == 3
         assert "transmitter `T1` is -1.8e+07 Hz; set `radio.centre_frequency_hz`" in error, error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("tones", "--accuracy-mrad", "nan"), 3, "`--accuracy-mrad` must"),
+        (("tones", "--accuracy-mrad", "5", "--band", "5", "1"), 3, "`--band` LOW HIGH must"),
+        (("tones", "--accuracy-mrad", "5", "-n", "9"), 3, "`--tones` must lie between 1 and 6"),
+        (("tones", "--accuracy-mrad", "5", "--success", "2"), 3, "`--success` must"),
+        (("tones", "--accuracy-mrad", "5", "--snr", "nan"), 3, "`--snr` must"),
+        (("map", "--snr", "inf"), 3, "`--snr` must"),
+        (("map", "--sun", "10", "-95"), 2, "--sun AZ EL needs an elevation above 0"),
+        (("map", "--year", "12000"), 2, "'--year'"),
+        (("map", "--day", "0001-01-01"), 2, "--day must lie between"),
+        (("optimise", "--height", "5", "1"), 3, "`--height` LOW HIGH must"),
+        (("optimise", "--separation", "-1"), 3, "`--separation` must"),
+        (("optimise", "--radius", "nan"), 3, "`--radius` must"),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else None,
+)
+def test_options_are_refused_by_their_own_names(files, arguments, code, message) -> None:
+    command, *options = arguments
+    found, _, error = run("layout", command, files["scenario"], *options)
+    assert found == code, error
+    assert message in error

@@ -4,6 +4,7 @@ import contextlib
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tomli_w
@@ -111,7 +112,6 @@ def test_damaged_tracking_runs(tracked, tmp_path, seed):
 
 
 def test_damaged_values_in_a_runs_tables(tracked, tmp_path):
-    import h5py
 
     rng = np.random.default_rng(7)
     for k in range(60):
@@ -254,3 +254,18 @@ def test_byte_order_marks_and_semicolons(files, tmp_path):
         with pytest.raises(RfposeError, match=message) as error:
             read_series_csv(table, wind, interval_s=1.0, longest_gap_s=10.0)
         assert "field.csv" in str(error.value)
+
+
+def test_values_that_stand_in_another_file_are_not_read(files, tracked, tmp_path):
+    for source, place, read in (
+        (files["result"], "poses/normal_enu", read_result),
+        (files["result"], "scenario", read_result),
+        (tracked, "time/unix_s", read_track),
+        (tracked, "method/radio/happened", read_track),
+    ):
+        path = copied(source, tmp_path)
+        with h5py.File(path, "r+") as file:
+            del file[place]
+            file[place] = h5py.ExternalLink(str(source), place)
+        with pytest.raises(RecordingError, match=rf"damaged\.h5: `/{place}` stands in another file"):
+            read(path)

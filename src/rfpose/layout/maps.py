@@ -46,6 +46,7 @@ __all__ = [
 
 IndexArray = npt.NDArray[np.int64]
 
+_MAX_DB = 300.0
 _COINCIDENT_M = 1e-6
 _FLAT = 1e-6
 """Extent of the transmitters across a line or plane, as a share of their largest, below which they lie in it."""
@@ -681,6 +682,8 @@ def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
         Overrides ``[simulation] tone_snr_db``.
     """
     plan = scenario.simulation
+    if tone_snr_db is not None and not abs(tone_snr_db) <= _MAX_DB:
+        raise InvalidInputError(f"`--snr` must be a number of decibels within ±{_MAX_DB:g}, got {tone_snr_db}")
     snr_first = 10.0 ** ((plan.tone_snr_db if tone_snr_db is None else tone_snr_db) / 10.0)
     index = np.array([t.modulation_index for t in scenario.tone])
     amplitude = np.array([t.amplitude for t in scenario.transmitter])

@@ -8,15 +8,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from rfpose.recording.hdf5 import FROM_SAMPLES, find_dataset
+
 __all__ = ["DAMAGES", "array_of", "format_of", "text_of"]
 
 DAMAGES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 """What h5py and numpy raise where a file is not what it says."""
 
 _LARGEST = 1e50
-_ALWAYS_READ_BYTES = 2**26
-_MOST_COMPRESSED = 1100
-"""Deflate makes no more than some 1030 bytes of one."""
 
 
 def format_of(path: str | Path) -> str | None:
@@ -29,15 +28,18 @@ def format_of(path: str | Path) -> str | None:
     return found if isinstance(found, str) else None
 
 
-def text_of(item: Any) -> str:
-    """Return the text that a dataset holds.
+def text_of(file: h5py.File, place: str) -> str:
+    """Return the text that the dataset at an absolute place holds.
 
     Raises
     ------
+    RecordingError
+        It lies in another file.
     ValueError
         It is missing, no single text, or not UTF-8.
     """
-    if not isinstance(item, h5py.Dataset) or item.shape != () or h5py.check_string_dtype(item.dtype) is None:
+    item = find_dataset(file, place, follow_links=False, per_stored=FROM_SAMPLES)
+    if item is None or item.shape != () or h5py.check_string_dtype(item.dtype) is None:
         raise ValueError("is missing or no text")
     try:
         raw = item[()]
@@ -46,18 +48,19 @@ def text_of(item: Any) -> str:
         raise ValueError(f"is not UTF-8 ({error})") from error
 
 
-def array_of(dataset: h5py.Dataset, dtype: Any) -> np.ndarray[Any, Any]:
-    """Return a dataset's values, after making sure that the file is large enough to hold them.
+def array_of(file: h5py.File, place: str, dtype: Any) -> np.ndarray[Any, Any]:
+    """Return the values of the dataset at an absolute place, which lie in the file and are as many as it can hold.
 
     Raises
     ------
+    RecordingError
+        They lie in another file, or more are declared than can be stored.
     ValueError
-        The dataset says that it holds more than the file can: reading it would only fill memory. A number is larger
-        than anything that is measured, and would overflow when it is squared.
+        There is none. A number is larger than anything that is measured, and would overflow when it is squared.
     """
-    stored = dataset.id.get_storage_size()
-    if dataset.nbytes > max(_ALWAYS_READ_BYTES, _MOST_COMPRESSED * stored):
-        raise ValueError(f"claims {dataset.nbytes} bytes, and {stored} are stored")
+    dataset = find_dataset(file, place, follow_links=False, per_stored=FROM_SAMPLES)
+    if dataset is None:
+        raise ValueError("is missing")
     values = np.asarray(dataset[()], dtype=dtype)
     if values.dtype.kind in "fc" and values.size:
         finite = np.where(np.isfinite(values), np.abs(values), 0.0)

@@ -38,6 +38,7 @@ from rfpose.pipeline.result import (
     Result,
     rate_of,
 )
+from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
@@ -309,14 +310,14 @@ class _Reader:
 
     def _scenario(self) -> Scenario:
         try:
-            return parse_scenario(text_of(self._file.get("scenario")), source=f"{self._path}:/scenario")
+            return parse_scenario(text_of(self._file, "/scenario"), source=f"{self._path}:/scenario")
         except ScenarioError as error:
             raise RecordingError(f"{error}; the result is damaged: process again") from error
         except ValueError as error:
             raise self._error(f"`/scenario` {error}", "process again") from error
 
     def _settings(self, scenario: Scenario) -> dict[str, str]:
-        group = self._file.get("settings")
+        group = find_item(self._file, "/settings", follow_links=False)
         found = dict(group.attrs.items()) if isinstance(group, h5py.Group) else {}
         for name, value in found.items():
             if not isinstance(value, str):
@@ -363,7 +364,7 @@ class _Reader:
 
     def _array(self, path: str) -> npt.NDArray[Any]:
         key = KEYS[path]
-        dataset = self._file.get(path)
+        dataset = find_item(self._file, f"/{path}", follow_links=False)
         if not isinstance(dataset, h5py.Dataset):
             raise self._error(f"`/{path}` is missing", "process again")
         if dataset.dtype.kind != np.dtype(key.dtype).kind:
@@ -379,7 +380,9 @@ class _Reader:
             if isinstance(axis, str):
                 self._length.setdefault(axis, got)
         try:
-            values = array_of(dataset, key.dtype)
+            values = array_of(self._file, f"/{path}", key.dtype)
+        except RecordingError:
+            raise
         except DAMAGES as error:
             raise self._error(f"`/{path}` {error}", "process again") from error
         self._check_codes(path, values)

@@ -30,6 +30,7 @@ from rfpose.kinds import told_kind
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
 from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
+from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import Scenario, parse_scenario
 
 __all__ = [
@@ -435,7 +436,7 @@ class _Reader:
         if not re.fullmatch(r"[0-9]{1,20}", settings.get("seed", "")):
             raise self._error("settings", "lacks the attribute `seed`, or it is no number")
         try:
-            scenario = parse_scenario(text_of(self._file.get("scenario")), source=f"{self._path}:/scenario")
+            scenario = parse_scenario(text_of(self._file, "/scenario"), source=f"{self._path}:/scenario")
         except ScenarioError as error:
             raise RecordingError(f"{error}; the run is damaged: {_AGAIN}") from error
         except ValueError as error:
@@ -468,24 +469,28 @@ class _Reader:
         return RecordingError(f"{self._path}: `/{place}` {what}; the run is damaged: {_AGAIN}")
 
     def _group(self, place: str) -> h5py.Group:
-        found = self._file.get(place)
+        found = find_item(self._file, f"/{place}", follow_links=False)
         if not isinstance(found, h5py.Group):
             raise self._error(place, "is missing or no group")
         return found
 
     def _names(self, place: str) -> tuple[str, ...]:
-        dataset = self._file.get(place)
+        dataset = find_item(self._file, f"/{place}", follow_links=False)
         if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or not h5py.check_string_dtype(dataset.dtype):
             raise self._error(place, "is missing or no list of texts")
         try:
             return tuple(dataset.asstr()[()].tolist())
+        except RecordingError:
+            raise
         except DAMAGES as error:
             raise self._error(place, f"cannot be read ({error})") from error
 
     def _json(self, wanted: TypeAdapter[Any], place: str, group: h5py.Group | None = None) -> Any:
         """Return what a text says; that of an attribute of ``group``, named by the place's last word, if given."""
         try:
-            raw = text_of(self._file.get(place)) if group is None else group.attrs[place.rpartition(" ")[2]]
+            raw = text_of(self._file, f"/{place}") if group is None else group.attrs[place.rpartition(" ")[2]]
+        except RecordingError:
+            raise
         except DAMAGES as error:
             raise self._error(place, f"is missing or no text ({error})") from error
         if not isinstance(raw, str):
@@ -500,7 +505,7 @@ class _Reader:
         return found
 
     def _array(self, place: str, axes: str) -> npt.NDArray[Any]:
-        dataset = self._file.get(place)
+        dataset = find_item(self._file, f"/{place}", follow_links=False)
         name = place.rpartition("/")[2]
         kind = "iu" if name in _INTEGERS else "f"
         if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kind:
@@ -510,7 +515,9 @@ class _Reader:
         if len(wanted) != dataset.ndim or tuple(lengths) != dataset.shape:
             raise self._error(place, f"has shape {dataset.shape}, not ({axes})")
         try:
-            return read_only(array_of(dataset, dataset.dtype.newbyteorder("=")))
+            return read_only(array_of(self._file, f"/{place}", dataset.dtype.newbyteorder("=")))
+        except RecordingError:
+            raise
         except DAMAGES as error:
             raise self._error(place, str(error)) from error
 

@@ -13,12 +13,13 @@ from itertools import pairwise
 from typing import Final
 
 from rfpose.errors import InvalidInputError
+from rfpose.scenario import MAX_SAMPLE_INDEX
 
 __all__ = ["LARGEST_INDEX", "Capture", "Stamp", "Timing", "parse_stamp", "place_captures", "stamp_text"]
 
 _DATETIME: Final = re.compile(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d{1,30}))?Z", re.ASCII)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-LARGEST_INDEX: Final = 2**62
+LARGEST_INDEX: Final = MAX_SAMPLE_INDEX
 _CLOCK: Final = Fraction(1, 1000)
 """No receiver's clock is off by more; a larger step between two stamps is lost samples."""
 _ON_GRID: Final = Fraction(1, 100)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -11,6 +12,7 @@ import click
 
 if TYPE_CHECKING:
     from rfpose.pipeline.layout.site import Postures
+
 
 __all__ = ["CRITERIA", "ESTIMATORS", "field_options", "postures"]
 
@@ -26,7 +28,9 @@ def field_options(function: F) -> F:
     options = (
         click.option("--stow", is_flag=True, help="Also the stow posture, face up."),
         click.option(
-            "--year", type=click.IntRange(min=1900), help="Every hour of the 21st of each month, sun above 5°."
+            "--year",
+            type=click.IntRange(min=1900, max=9998),
+            help="Every hour of the 21st of each month, sun above 5°.",
         ),
         click.option("--day", type=click.DateTime(["%Y-%m-%d"]), help="Every half hour of this day, sun above 5°."),
         click.option(
@@ -52,4 +56,9 @@ def postures(suns: tuple[tuple[float, float], ...], day: datetime | None, year: 
     """Return the postures that the options name."""
     from rfpose.pipeline.layout.site import Postures
 
+    if day is not None and not 1900 <= day.year <= 9998:
+        raise click.UsageError(f"--day must lie between the years 1900 and 9998, got {day:%Y-%m-%d}")
+    for azimuth, elevation in suns:
+        if not (math.isfinite(azimuth) and 0.0 < elevation <= 90.0):
+            raise click.UsageError(f"--sun AZ EL needs an elevation above 0 and up to 90 degrees, got {elevation:g}")
     return Postures(suns_deg=suns, day=None if day is None else day.date(), year=year, stow=stow)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.errors import GeometryError, ScenarioError
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.files import write_atomically
 from rfpose.layout import maps
 from rfpose.layout.fields import read_positions
@@ -79,6 +79,13 @@ class Rules:
         """Return the rules with defaults taken from the transmitters as they stand."""
         own_radius = float(np.hypot(transmitter_enu_m[:, 0], transmitter_enu_m[:, 1]).max())
         radius = own_radius if self.radius_m is None else self.radius_m
+        for name, value in (("--radius", self.radius_m), ("--separation", self.separation_m)):
+            if value is not None and not 0.0 <= value < np.inf:
+                raise InvalidInputError(f"`{name}` must be a number of metres, not negative, got {value}")
+        if not 0.0 <= self.clearance_m < np.inf:
+            raise InvalidInputError(f"`--clearance` must be a number of metres, not negative, got {self.clearance_m}")
+        if self.height_m is not None and not self.height_m[0] <= self.height_m[1]:
+            raise InvalidInputError(f"`--height` LOW HIGH must be in this order, got {self.height_m}")
         heights = (float(transmitter_enu_m[:, 2].min()), float(transmitter_enu_m[:, 2].max()))
         ground = Zone(radius_m=radius)
         if self.outline_csv is not None:

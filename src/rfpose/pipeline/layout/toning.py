@@ -12,7 +12,7 @@ from rfpose.dsp.bounds import phase_bound_rad
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS, Noise
-from rfpose.multilat.tones import Share, ToneDesign, design_tones
+from rfpose.multilat.tones import MAX_TONE, Share, ToneDesign, design_tones
 from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["SiteTones", "design_site_tones"]
@@ -54,6 +54,20 @@ class SiteTones:
             "step_risk": self.tones.step_risk,
             "wrong_risk": self.tones.wrong_risk,
         }
+
+
+def _check_wishes(
+    accuracy_mrad: float, success: float, band_hz: tuple[float, float] | None, n_tone: int | None
+) -> None:
+    """Refuse what nobody can wish for, by the names that the command line has for it."""
+    if not 0.0 < accuracy_mrad < np.inf:
+        raise InvalidInputError(f"`--accuracy-mrad` must be a number greater than zero, got {accuracy_mrad}")
+    if not 0.0 < success < 1.0:
+        raise InvalidInputError(f"`--success` must lie between 0 and 1, got {success}")
+    if band_hz is not None and not 0.0 <= band_hz[0] < band_hz[1]:
+        raise InvalidInputError(f"`--band` LOW HIGH must begin at 0 Hz or above and end higher, got {band_hz}")
+    if n_tone is not None and not 1 <= n_tone <= MAX_TONE:
+        raise InvalidInputError(f"`--tones` must lie between 1 and {MAX_TONE}, got {n_tone}")
 
 
 def _by_carriers(scenario: Scenario, accuracy_mrad: float) -> str:
@@ -109,10 +123,15 @@ def design_site_tones(
 
     Raises
     ------
+    InvalidInputError
+        A wish out of its range, by its name on the command line.
     ScenarioError
         The scenario is bad, or no tones do; the message begins with the file.
     """
+    _check_wishes(accuracy_mrad, success, band_hz, n_tone)
     scenario = load_scenario(scenario_path)
+    if tone_snr_db is not None:
+        maps.noise_of(scenario, tone_snr_db=tone_snr_db)
     try:
         transmitter = maps.check_site(scenario.transmitter_enu_m)
         mirrors = maps.mirrors_of(scenario)
