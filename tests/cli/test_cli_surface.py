@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import re
+import shutil
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
 import click
@@ -17,6 +21,7 @@ import rfpose
 from rfpose.cli import _app
 from rfpose.cli._support import emit_json
 from rfpose.cli.process import ESTIMATOR_NAMES
+from rfpose.recording import RecordingWriter
 
 HEAVY = ("numpy", "scipy", "numba", "h5py", "pydantic", "matplotlib", "rich")
 
@@ -33,6 +38,115 @@ def test_help_loads_nothing_heavy() -> None:
     assert done.stderr.strip() == "[]"
     for name in _app.COMMANDS:
         assert name in done.stdout
+
+
+COMPILED = ("numba", "scipy", "pvlib", "matplotlib", "PySide6")
+
+
+@pytest.mark.parametrize(
+    ("words", "says", "unloaded"),
+    [
+        ("simulate there -o there", "the same", HEAVY),
+        ("process there.h5 -o there", "exists already", HEAVY),
+        ("convert there.h5 -o there", "exists already", HEAVY),
+        ("track there.toml -o there", "exists already", HEAVY),
+        ("layout map there.toml --csv there", "exists already", HEAVY),
+        ("view absent.h5 --save x.png", "no such file", HEAVY),
+        ("evaluate absent.h5", "no such file", HEAVY),
+        ("info absent.h5", "no such file", HEAVY),
+        ("calibrate absent", "no such file", HEAVY),
+        ("aim absent.json --dish --start 2026-06-21T06:00Z", "no such file", HEAVY),
+        ("demo -o .", "exists already", HEAVY),
+        ("simulate bad.toml -o x.h5", "not valid TOML", COMPILED),
+        ("track bad.toml -o x.h5", "not valid TOML", COMPILED),
+        ("layout map bad.toml", "not valid TOML", COMPILED),
+        ("layout budget bad.toml", "not valid TOML", COMPILED),
+        ("layout optimise bad.toml", "not valid TOML", COMPILED),
+        ("layout tones bad.toml --accuracy-mrad 1", "not valid TOML", COMPILED),
+        ("process bare.h5 -o x.h5", "holds no scenario", COMPILED),
+        ("process bare.h5 --scenario bad.toml -o x.h5", "not valid TOML", COMPILED),
+        ("convert absent.h5 -o x.h5", "no such file", COMPILED),
+    ],
+)
+def test_a_refusal_waits_for_nothing_heavy(tmp_path: Path, words: str, says: str, unloaded: tuple[str, ...]) -> None:
+    """What is loaded, not how long it takes: that depends on the machine."""
+    for name in ("there", "there.h5", "there.toml", "spectrum.png"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "bad.toml").write_text("= 3")
+    if "bare" in words:
+        settings = {"scenario": None, "receiver_ids": ["a"], "sample_rate": Fraction(1), "centre_frequency_hz": None}
+        with RecordingWriter(
+            tmp_path / "bare.h5", **settings, sample_format="int16", full_scale=1.0, provenance={}
+        ) as writer:
+            writer.write("a", 0, np.zeros((9, 2), np.int16))
+    code = (
+        "import sys\nfrom rfpose.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as done: assert done.code == 3\n"
+        f"print([name for name in {unloaded!r} if name in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert says in done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+SLOW = """
+import sys, time
+import rfpose.cli._support as support, rfpose.pipeline.inspect as inspect
+support._EVERY_S = 0.05
+def slow(path):
+    with support.progress("Looking") as shown:
+        time.sleep(0.2)
+        shown(1, 4)
+        time.sleep(0.2)
+    return {"kind": "nothing"}
+inspect.inspect_file = slow
+from rfpose.cli import main
+main()
+"""
+
+
+def test_long_work_is_told_without_a_terminal(tmp_path: Path) -> None:
+    (tmp_path / "x").write_text("")
+    command = [sys.executable, "-c", SLOW, "info", str(tmp_path / "x"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"kind": "nothing"}
+    lines = done.stderr.splitlines()
+    assert re.fullmatch(r"rfpose: Looking, for \d+ s", lines[0])
+    assert re.fullmatch(r"rfpose: Looking: 1 of 4, \d+ s left", lines[-1])
+
+
+KERNEL = """
+from rfpose.cli._app import _notes_to_stderr
+import numpy as np, rfpose.multilat._kernels as kernels
+from rfpose.jit import kernel
+@kernel
+def one(x):
+    return x + 1.0
+one.py_func.__module__ = "rfpose.test._kernels"
+with _notes_to_stderr():
+    assert one(2.0) == 3.0
+    assert one(2) == 3
+"""
+
+
+def test_kernels_work_where_no_cache_can_be_written(tmp_path: Path) -> None:
+    """A place below a file cannot be made, whoever tries."""
+    (tmp_path / "file").write_text("")
+    shutil.copytree(Path(rfpose.__file__).parent, tmp_path / "rfpose", ignore=shutil.ignore_patterns("__pycache__"))
+    for where in (tmp_path / "rfpose").rglob("_kernels.py"):
+        (where.parent / "__pycache__").write_text("")
+    (tmp_path / "k.py").write_text(KERNEL)
+    (tmp_path / "__pycache__").write_text("")
+    home = str(tmp_path / "file" / "home")
+    environment = {key: value for key, value in os.environ.items() if key not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")}
+    environment |= {"HOME": home, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run([sys.executable, "k.py"], capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    first, second = done.stderr.splitlines()
+    assert first.startswith("rfpose: note: compiling kernels, once")
+    assert "NUMBA_CACHE_DIR" in second
 
 
 def _words() -> list[str]:
