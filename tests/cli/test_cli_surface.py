@@ -95,7 +95,7 @@ SLOW = """
 import sys, time
 import rfpose.cli._support as support, rfpose.pipeline.inspect as inspect
 support._EVERY_S = 0.05
-def slow(path):
+def slow(path, **_settings):
     with support.progress("Looking") as shown:
         time.sleep(0.2)
         shown(1, 4)

@@ -126,7 +126,7 @@ def test_no_error_of_a_callback_is_lost(
     (tmp_path / "x.h5").unlink()
     n_call = calls[0]
     assert n_call > 0
-    for n in sorted({1, min(2, n_call), max(1, n_call // 2), n_call}):
+    for n in range(1, n_call + 1):
         calls[0], at[0] = 0, n
         with pytest.raises(RecordingError if error is OSError else error):
             write()
@@ -187,20 +187,23 @@ def test_killed_between_result_and_table_the_same_command_goes_on(made: Path, tm
     assert _run(*words).returncode == 3  # now it is done, and nothing of it is taken for unfinished
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux exchanges names; see the next test")
 def test_a_directory_is_replaced_in_one_step(made: Path, tmp_path: Path) -> None:
-    """Killed at any rename, there is a whole recording under the name."""
+    """Killed right after the exchange, or after any plain renaming, there is a whole recording under the name."""
     shutil.copytree(made / "sig", tmp_path / "sig")
     before = _names(tmp_path / "sig")
     kill = (
-        "import rfpose.files as f, os, signal, pathlib\n"
+        "import rfpose.files as f, os, signal\n"
         "plain = f._exchange\n"
         "def killed(one, other):\n"
-        "    done = plain(one, other); os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    if plain(one, other): os.kill(os.getpid(), signal.SIGKILL)\n"
         "f._exchange = killed\nfrom rfpose.cli import main; main()"
     )
     words = ["convert", str(made / "rec.h5"), "-o", str(tmp_path / "sig"), "--to", "sigmf", "--force"]
     killed = subprocess.run([sys.executable, "-c", kill, *words], capture_output=True, timeout=300)
     assert killed.returncode == -signal.SIGKILL
+    assert _names(tmp_path / "sig") == before
+    _run(*words, at=("SIGKILL", "rename", 1))
     assert _names(tmp_path / "sig") == before
     assert _run(*words).returncode == 0
     assert _names(tmp_path) == {"sig"}
