@@ -67,7 +67,7 @@ def test_process_prints_counts_and_reasons(directory: Path, tmp_path: Path) -> N
     assert shown.exit_code == 0
     assert "mirror poses" in shown.stdout
     assert "1 poses: fewer than three receivers of the mirror were located" in shown.stdout
-    assert "18 tones: carrier not found above the noise" in shown.stdout
+    assert "18 transmitters: carrier not found above the noise" in shown.stdout
     assert shown.stderr == ""
 
 
@@ -161,7 +161,7 @@ def test_broken_result_is_exit_3(directory: Path, tmp_path: Path, spoil: Any) ->
 
 
 def test_a_fault_of_our_own_is_exit_1_in_one_line(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fault(_path: Path) -> None:
+    def fault(_path: Path, **_settings: object) -> None:
         raise ZeroDivisionError("no such\nluck")
 
     monkeypatch.setattr("rfpose.pipeline.inspect.inspect_file", fault)
