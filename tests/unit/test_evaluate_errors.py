@@ -210,11 +210,11 @@ def test_truth_from_json(result: Result, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "not a truth file"),
+        ("{", "not valid JSON.*it must hold `heliostats`"),
         ("[]", "not a truth file"),
         ("{}", "`heliostats` is missing"),
-        ('{"heliostats": [{"id": "H01"}]}', "`normal_enu` is missing"),
-        ('{"heliostats": [{"id": "H01", "normal_enu": [0, 1]}]}', r"`normal_enu` must have shape \(3\), got \(2,\)"),
+        ('{"heliostats": [{"id": "H01"}]}', r"`heliostats\[0\]\.normal_enu` is missing"),
+        ('{"heliostats": [{"id": "H01", "normal_enu": [0, 1]}]}', r"normal_enu` must have shape \(3\), got \(2,\)"),
         ('{"heliostats": [{"id": "H01", "normal_enu": [0, 0, 1], "receivers_enu_m": [[1, 2, 3]]}]}', "receivers_enu_m"),
     ],
 )

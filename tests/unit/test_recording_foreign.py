@@ -307,7 +307,10 @@ def test_sigmf_annotations_and_undeclared_extensions_are_no_faults(tmp_path):
         ({"rate": 1e13}, "`global.core:sample_rate`: 10000000000000.0 is greater than the maximum"),
         ({"core:dataset": 5}, "`core:dataset` must be a file name, got 5"),
         ({"captures": [{"core:sample_start": 0, "core:datetime": "2026-02-30T12:00:00Z"}]}, "no time of Unix"),
-        ({"captures": [{"core:sample_start": 0, "core:global_index": 2**62}]}, "must be a whole number below 2\\^62"),
+        (
+            {"captures": [{"core:sample_start": 0, "core:global_index": 2**63 - 1}]},
+            "must be a whole number below 9223[0-9]{15}",
+        ),
         ({"datatype": "cu8"}, "`core:datatype` is cu8; rfpose reads ci16 and cf32"),
         ({"core:offset": 100}, "`core:offset` is not supported"),
         ({"core:num_channels": 2}, "interleaved channels"),

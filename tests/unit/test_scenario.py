@@ -134,5 +134,5 @@ def test_missing_and_binary_files(tmp_path):
     with pytest.raises(ScenarioError, match=r"nowhere\.toml"):
         load_scenario(tmp_path / "nowhere.toml")
     (tmp_path / "binary.toml").write_bytes(b"\x89HDF\r\n\xff\xfe")
-    with pytest.raises(ScenarioError, match="TOML in UTF-8"):
+    with pytest.raises(ScenarioError, match=r"binary\.toml: is not text in UTF-8 .*check that it is the right file"):
         load_scenario(tmp_path / "binary.toml")

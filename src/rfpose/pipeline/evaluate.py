@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -238,10 +238,19 @@ def read_truth(path: str | Path, scenario: Scenario, *, follow_links: bool = Fal
     return align_truth(truth, scenario)
 
 
+_T = TypeVar("_T")
 _TRUTH_BYTES = 2**28
 _TRUTH_REMEDY = (
     "it must hold `heliostats`, a list with `id`, `normal_enu` [x, y, z] and `receivers_enu_m` [[x, y, z], …] of each"
 )
+
+
+def _field(path: Path, entry: Any, k: int, key: str, kind: type[_T]) -> _T:
+    value = entry.get(key) if isinstance(entry, dict) else None
+    if not isinstance(value, kind):
+        what = "is missing" if value is None else f"must be a {kind.__name__}, got {value!r:.60}"
+        raise RecordingError(f"{path}: not a truth file: `heliostats[{k}].{key}` {what}; {_TRUTH_REMEDY}")
+    return value
 
 
 def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
@@ -254,20 +263,18 @@ def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
     index = {name: i for i, name in enumerate(scenario.heliostat_ids)}
     known = 0
     for k, entry in enumerate(entries):
-        place = f"heliostats[{k}]"
-        for key in ("id", "normal_enu", "receivers_enu_m"):
-            if not isinstance(entry, dict) or key not in entry:
-                raise RecordingError(f"{path}: not a truth file: `{place}.{key}` is missing; {_TRUTH_REMEDY}")
-        i = index.get(entry["id"]) if isinstance(entry["id"], str) else None
+        i = index.get(_field(path, entry, k, "id", str))
         if i is None:
             continue
         rows = scenario.receiver_rows(i)
         try:
-            normal = as_float_array(f"{place}.normal_enu", entry["normal_enu"], (3,))
+            name = f"heliostats[{k}].normal_enu"
+            normal = as_float_array(name, _field(path, entry, k, "normal_enu", list), (3,))
             if not np.linalg.norm(normal) > 0.0:
-                raise InvalidInputError(f"`{place}.normal_enu` must not be zero")
+                raise InvalidInputError(f"`{name}` must not be zero")
+            places = _field(path, entry, k, "receivers_enu_m", list)
             shape = (rows.stop - rows.start, 3)
-            receiver_enu_m[0, rows] = as_float_array(f"{place}.receivers_enu_m", entry["receivers_enu_m"], shape)
+            receiver_enu_m[0, rows] = as_float_array(f"heliostats[{k}].receivers_enu_m", places, shape)
         except InvalidInputError as error:
             raise RecordingError(f"{path}: not a truth file: {error}; {_TRUTH_REMEDY}") from error
         normal_enu[0, i] = unit(normal)

@@ -276,7 +276,9 @@ def _capture(i: int, capture: dict[str, Any], rate: Fraction) -> Capture:
             raise InvalidInputError(f"capture {i}: `{name}` must be a whole number, got {value!r}")
         exact = None if value is None else exact_number(name, value)
         if exact is not None and (exact.denominator != 1 or not 0 <= exact < LARGEST_INDEX):
-            raise InvalidInputError(f"capture {i}: `{name}` must be a whole number below 2^62, got {value!r:.40}")
+            raise InvalidInputError(
+                f"capture {i}: `{name}` must be a whole number below {LARGEST_INDEX}, got {value!r:.40}"
+            )
         counts.append(None if exact is None else int(exact))
     stamp = None if capture.get("core:datetime") is None else parse_stamp(capture["core:datetime"], rate)
     return Capture(first_sample=counts[0] or 0, stamp=stamp, global_index=counts[1])

@@ -44,7 +44,7 @@ def test_bad_csv_names_the_place(tmp_path, text, message):
 
 
 def test_missing_csv(tmp_path):
-    with pytest.raises(ScenarioError, match="cannot read"):
+    with pytest.raises(ScenarioError, match=r"none\.csv: cannot be read"):
         read_positions(tmp_path / "none.csv")
 
 
