@@ -164,8 +164,9 @@ def locate(
         On which side of the transmitters' plane receivers are KNOWN to be; one for all or one a receiver. Transmitters
         of similar height have a second solution near the mirror image in their plane, which noise can make the better
         one. The solution on the known side is taken unless it is a million times less likely than noise or the other
-        side would have it; of two there, the better one. None: nothing is known, and the better one counts; where
-        neither wins (`DECISIVE_CHI2`) it is the lower one and the row is AMBIGUOUS. In two dimensions, where that
+        side would have it; of two there (a plane that leans), the better one, which is not marked. None: nothing is
+        known, and the better one counts; where neither wins (`DECISIVE_CHI2`) it is the lower one and the row is
+        AMBIGUOUS. In two dimensions, where that
         means a line, nothing is known. Without effect with a given start.
     max_iteration
         Gauss-Newton steps before a row is given up (twice as many, half as long, from other starts).
