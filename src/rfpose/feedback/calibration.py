@@ -325,7 +325,8 @@ def sun_convention(mount: Mount, measurements: Measurements) -> tuple[float, tup
     median_rad
         Median error of the nominal mount's normals [rad]; zero without measurements of the sun.
     signs
-        By which east and north must be multiplied to mend it; None if that does not help or nothing is wrong.
+        By which east and north must be multiplied to mend it; None if that does not help, if other zeros of the axes
+        do as well, or if nothing is wrong.
     """
     sunny = measurements.take((measurements.row[:, 3] == 0.0) & (measurements.row[:, 7] == 1.0))
     sunny = sunny.take(row_status(mount, sunny) == RowStatus.USED)
@@ -337,6 +338,19 @@ def sun_convention(mount: Mount, measurements: Measurements) -> tuple[float, tup
             row = sunny.row.copy()
             row[:, :2] *= signs
             changed = Measurements(count=sunny.count, row=row, unix_s=sunny.unix_s)
-            if float(np.nanmedian(normal_errors_rad(mount, changed))) < 0.3 * before:
+            after = float(np.nanmedian(normal_errors_rad(mount, changed)))
+            if after < min(0.3 * before, _median_with_other_zeros_rad(mount, sunny)):
                 return before, signs
     return before, None
+
+
+def _median_with_other_zeros_rad(mount: Mount, measurements: Measurements) -> float:
+    """Median error once the axes' zeros are fitted: a mount far from its plan is told from suns counted otherwise."""
+    free = PARAMETER_SETS["offsets"]
+    p, k = stack_mounts([mount])
+    count, row = measurements.count[None].copy(), measurements.row[None].copy()
+    (values,) = solve(p, k, count, row, np.ones((1, len(measurements)), np.bool_), free, FitSettings()).working
+    if not np.isfinite(values).all():
+        return float("inf")
+    turned = mount.replace(**dict(zip(free, values.tolist(), strict=True)))
+    return float(np.nan_to_num(np.nanmedian(normal_errors_rad(turned, measurements)), nan=np.inf))

@@ -130,7 +130,8 @@ def choose(
     held = np.concatenate(folds)
     errors: dict[str, FloatArray] = {}
     for name, free in sets.items():
-        error, _ = refit(mount, measurements, stacked, free, with_priors(mount, free, settings))
+        # a single measurement leaves none to predict it from
+        error = refit(mount, measurements, stacked, free, with_priors(mount, free, settings))[0] if len(held) else held
         errors[name] = np.where(held, error, np.nan)
     edges = np.cumsum([0, *(len(fold) for fold in folds)])
     return tuple(
