@@ -13,6 +13,8 @@ from rfpose.feedback.calibration import FitStatus, fit
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus, command
 from rfpose.feedback.paint import enu_from_wgs84, heliostat_ids, read_heliostat
+from rfpose.feedback.prediction import normal_errors_rad
+from rfpose.feedback.selection import fit_chosen
 from rfpose.feedback.sun import sun_position
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits
 from rfpose.pipeline.calibrate import calibrate_paint, draw_errors, write_models
@@ -118,6 +120,29 @@ def test_a_jumping_heliostat_is_flagged_and_quiet_ones_are_not():
         assert alarms(fit(data.mount, made, free="level-full")) == ()
 
 
+@pytest.mark.parametrize("n", [2, 4, 6, 24, 29])
+def test_few_records_choose_no_more_than_they_carry(n):
+    # where the fixed four go on, auto is at most half as bad again; the rest of the records judge
+    for name in QUIET:
+        data, made = measured(name)
+        index = np.linspace(0, len(made) - 1, n).astype(int)
+        rest = made.take(np.setdiff1d(np.arange(len(made)), index))
+        chosen = fit_chosen(data.mount, made.take(index))
+        four = fit(data.mount, made.take(index), free="level-4")
+        auto_rad, four_rad = (float(np.nanmedian(normal_errors_rad(m.mount, rest))) for m in (chosen, four))
+        assert auto_rad < 1.5 * four_rad, (name, n)
+        assert chosen.field.carried[0] <= 2 * n
+
+
+def test_a_jumping_heliostat_is_flagged_with_chosen_parameters_too():
+    data, made = measured("BE61")
+    raised = alarms(fit_chosen(data.mount, made))
+    assert any(alarm.kind == "shift" and abs(alarm.size_rad) > 5e-3 for alarm in raised)
+    for name in QUIET:
+        data, made = measured(name)
+        assert not any(alarm.kind != "outlier" for alarm in alarms(fit_chosen(data.mount, made)))
+
+
 def test_commands_of_the_calibrated_mount_are_those_that_were_driven():
     data, made = measured("BH36")
     found = fit(data.mount, made, free="level-full")
@@ -187,7 +212,7 @@ def test_a_record_without_a_spot_is_left_out(copy):
     record = json.loads(path.read_text())
     path.write_text(json.dumps(record | {"focal_spot": {}}))
     data = read_heliostat(copy, "BF57")
-    assert data.skipped[path.name.split("_")[0]] == "no focal spot"
+    assert data.skipped[path.name.split("_")[0]] == f"{path}: no focal spot; measure again"
     path.write_text(json.dumps(record | {"sun_elevation": -3.0}))
     assert "horizon" in read_heliostat(copy, "BF57").skipped[path.name.split("_")[0]]
 
@@ -208,7 +233,7 @@ def test_a_spot_off_the_target_is_left_out(copy):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is not JSON"),
+        ("{", "not valid JSON"),
         ("[]", "one JSON object"),
         ('{"focal_spot": {"HeliOS": [50, 6, 9], "UTIS": [50, 6, 9]}}', "motor_position"),
         (
@@ -219,15 +244,22 @@ def test_a_spot_off_the_target_is_left_out(copy):
     ],
 )
 def test_broken_records_are_named(copy, text, message):
+    # one of them is left out, all of them are an error
     path = first_record(copy)
     path.write_text(text)
+    data = read_heliostat(copy, "BF57")
+    assert len(data.record_ids) == 5
+    assert message in data.skipped[path.name.split("_")[0]]
+    assert path.name in data.skipped[path.name.split("_")[0]]
+    for other in path.parent.iterdir():
+        other.write_text(text)
     with pytest.raises(RecordingError, match=message) as caught:
         read_heliostat(copy, "BF57")
     assert path.name in str(caught.value)
 
 
 def test_missing_files_are_named(copy, tmp_path):
-    with pytest.raises(RecordingError, match="no such directory"):
+    with pytest.raises(RecordingError, match="No such file or directory"):
         heliostat_ids(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="known heliostats: BF57"):
         read_heliostat(copy, "XX99")
