@@ -10,12 +10,19 @@ import pytest
 import tomli_w
 
 from damage import as_json, copied, damage_bytes, damage_hdf5, damage_values
+from paint_files import write_json, write_paint
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.feedback.mount import Mount
+from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.series import Quantity, read_series_csv
 from rfpose.layout.fields import read_positions
+from rfpose.pipeline.aim import plan_commands
+from rfpose.pipeline.calibrate import calibrate_paint, write_models
+from rfpose.pipeline.calibration_sources import read_drone, read_radio
 from rfpose.pipeline.evaluate import evaluate, read_truth
 from rfpose.pipeline.field_view import field_of_result, field_of_scenario, history
 from rfpose.pipeline.inspect import inspect_file
+from rfpose.pipeline.mount_file import read_models
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result_file import read_result
 from rfpose.pipeline.result_summary import write_poses_csv
@@ -269,3 +276,87 @@ def test_values_that_stand_in_another_file_are_not_read(files, tracked, tmp_path
             file[place] = h5py.ExternalLink(str(source), place)
         with pytest.raises(RecordingError, match=rf"damaged\.h5: `/{place}` stands in another file"):
             read(path)
+
+
+@pytest.fixture(scope="module")
+def paint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_paint(tmp_path_factory.mktemp("paint"), {"AA11": (20.0, 80.0, 1.5)}, n_record=3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_damaged_paint_directories(paint, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    sound = sorted(paint.rglob("*.json"))
+    for k in range(60):
+        folder = tmp_path / str(k)
+        for path in sound:
+            write_json(folder / path.relative_to(paint), json.loads(path.read_text()))
+        path = folder / sound[rng.integers(len(sound))].relative_to(paint)
+        if k % 4 == 0:
+            how = damage_bytes(path, rng)
+        else:
+            data = json.loads(path.read_text())
+            how = damage_values(data, rng)
+            path.write_text(as_json(data))
+        try:
+            found = refused(path, lambda _, folder=folder: read_heliostat(folder, "AA11", algorithm="any"), how)
+            if found is not None:
+                assert np.isfinite(found.spot_enu_m).all()
+                assert all(path.name in reason for reason in found.skipped.values())
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {path.name}, {how}: {error!r}") from error
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_damaged_models(paint, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    model = tmp_path / "model.json"
+    write_models(model, calibrate_paint(paint, free="offsets"))
+    content = model.read_text()
+    for k in range(60):
+        model.write_text(content)
+        if k % 4 == 0:
+            how = damage_bytes(model, rng)
+        else:
+            data = json.loads(content)
+            how = damage_values(data, rng)
+            model.write_text(as_json(data))
+        try:
+            known = refused(model, read_models, how)
+            if known is not None and k % 6 == 1:
+                with contextlib.suppress(RfposeError):
+                    plan_commands(model, target_enu_m=(0.0, 0.0, 36.0), start="2026-06-21T08:00Z", hours=1.0)
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {how}: {error!r}") from error
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_damaged_tables_of_motors_and_drones(files, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    mounts = {"A": Mount(pivot_enu_m=np.array([0.0, 80.0, 3.0]))}
+    places = ",".join(f"{what}_{axis}_m" for what in ("drone", "target") for axis in ("east", "north", "up"))
+    tables = {
+        "flight.csv": f"time_utc,heliostat,axis_1,axis_2,{places}\n"
+        + "2026-06-21T08:00:00Z,A,0.1,0.3,5.0,20.5,60.0,0.0,0.0,20.0\n" * 3,
+        "motors.csv": "time_utc,heliostat,axis_1,axis_2\n" + "1970-01-01T00:00:00Z,H001,0.1,0.3\n" * 3,
+    }
+    readers = {
+        "flight.csv": lambda path: read_drone(path, mounts),
+        "motors.csv": lambda path: read_radio([files["result"]], path),
+    }
+    for k in range(80):
+        name = ("flight.csv", "motors.csv")[k % 2]
+        path = tmp_path / name
+        path.write_text(tables[name])
+        if k % 4 < 2:
+            how = damage_bytes(path, rng)
+        else:
+            lines = [line.split(",") for line in tables[name].splitlines()]
+            row = lines[rng.integers(len(lines))]
+            how = row[at := int(rng.integers(len(row)))] = ("", "nan", "1e999", "x" * 500, '"', ";", "-1e300")[k % 7]
+            path.write_text("\n".join(",".join(line) for line in lines))
+            how = f"column {at}: {how!r:.30}"
+        try:
+            refused(path, readers[name], how)
+        except Exception as error:
+            raise AssertionError(f"seed {seed}, {k}, {name}, {how}: {error!r}") from error

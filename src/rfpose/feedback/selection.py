@@ -3,7 +3,7 @@
 Every candidate is fitted with priors about the mount as planned (or last calibrated), so that what the measurements do
 not tell stays there. Time is cut into blocks and each block predicted from the others, since to predict other hours
 and seasons than those measured is what a plant does. The smallest candidate that predicts as well as the best one, to
-within the standard error of their difference, is chosen.
+within a fiftieth, is chosen.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def _folds(measurements: Measurements, mask: npt.NDArray[np.bool_]) -> npt.NDArr
 
 
 def _choice(sets: Mapping[str, tuple[str, ...]], errors: Mapping[str, FloatArray], sigma_rad: FloatArray) -> Choice:
-    """Smallest set that predicts as well as the best, to within the standard error of the difference."""
+    """Smallest set that predicts as well as the best, to within a fiftieth."""
     held = {name: error[np.isfinite(error)] for name, error in errors.items()}
     n = min(len(error) for error in held.values())
     smallest = next(iter(sets))
@@ -197,16 +197,19 @@ def _choice(sets: Mapping[str, tuple[str, ...]], errors: Mapping[str, FloatArray
             held_out_sigma=0.0,
             reason="too few measurements to hold any out",
         )
+    if n < 2 * _BLOCKS:
+        # of blocks this small zeros alone win by luck; priors keep the larger sets in check
+        held.pop(smallest)
     cap = _CAP * min(float(np.median(error)) for error in held.values())
     capped = {name: np.minimum(error, cap) for name, error in held.items()}
     mean = {name: float(error.mean()) for name, error in capped.items()}
     best = min(mean, key=lambda name: mean[name])
-    name = next(name for name in sets if mean[name] <= _AS_GOOD * mean[best])
+    name = next(name for name in mean if mean[name] <= _AS_GOOD * mean[best])
     told = f"{1e3 * mean[name]:.2f} mrad on the time-blocks held out"
     reason = (
-        f"best of {len(sets)}: {told}"
+        f"best of {len(mean)}: {told}"
         if name == best
-        else f"{told}, as good as {best} ({1e3 * mean[best]:.2f}) to within its standard error, with fewer parameters"
+        else f"{told}, as good as {best} ({1e3 * mean[best]:.2f}), with fewer parameters"
     )
     scatter = float(np.nanmedian(errors[name] / sigma_rad)) / RAYLEIGH_MEDIAN
     return Choice(chosen=name, free=sets[name], held_out_rad=mean, held_out_sigma=scatter, reason=reason)
