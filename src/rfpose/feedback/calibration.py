@@ -118,7 +118,7 @@ def fit(
         raise InvalidInputError(
             f"measured and planned normals differ by {1e3 * before:.0f} mrad in the median, and fitted ones still by "
             f"{1e3 * after:.0f}: check that motor positions are in the mount's counts, positions in the site frame, "
-            "and angles in the unit that is asked for"
+            "and angles in the unit that is asked for (radians or degrees)"
         )
     return Calibration(
         mount=fitted,
