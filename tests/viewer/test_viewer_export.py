@@ -18,7 +18,7 @@ from PySide6.QtGui import QImage
 
 from rfpose.cli import _app
 from rfpose.cli import view as command
-from rfpose.errors import InvalidInputError, RecordingError, RfposeError
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError, install_remedy
 from rfpose.recording import open_recording
 from rfpose.recording.conversion import convert
 from rfpose.recording.native import NativeRecording
@@ -157,7 +157,8 @@ def test_report_escapes_what_the_file_says(qapp, files: dict[str, Path], tmp_pat
             "no heliostat `H99`; choose one of H01, H02",
         ),
         (["{tmp}/none.h5", "--save", "{tmp}/a.png"], 3, "no such file"),
-        (["{scenario}", "--save", "{scenario}"], 3, "exists already"),
+        (["{scenario}", "--save", "{scenario}"], 3, "must end in .png, .svg, .html"),
+        (["{scenario}", "--save", "{tmp}/old.svg"], 3, "exists already"),
         (["{scenario}", "--save", "{tmp}/no/where/a.png"], 3, "its directory does not exist"),
         (["--save", "{tmp}/a.png"], 2, "--save needs a FILE"),
     ],
@@ -165,9 +166,11 @@ def test_report_escapes_what_the_file_says(qapp, files: dict[str, Path], tmp_pat
 def test_what_cannot_be_drawn_is_one_line(
     qapp, files: dict[str, Path], tmp_path: Path, arguments: list[str], code: int, message: str
 ) -> None:
+    (tmp_path / "old.svg").write_text("old")
     done = run(*(part.format(tmp=tmp_path, scenario=files["scenario"]) for part in arguments))
     assert done.exit_code == code
     assert message in done.stderr
+    assert (tmp_path / "old.svg").read_text() == "old"
     assert not (tmp_path / "a.png").exists()
 
 
@@ -196,7 +199,7 @@ def test_without_the_extra(tmp_path: Path) -> None:
     done = rfpose_view(hide)
     assert done.returncode == 3
     assert done.stderr.splitlines() == [
-        "rfpose: the viewer needs PySide6 and pyqtgraph; install the extra: pip install 'rfpose[gui]'"
+        f"rfpose: the viewer needs PySide6 and pyqtgraph; install them, {install_remedy('gui')}"
     ]
 
 
