@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import signal
 from typing import Any
 
+import Callable
 import numpy as np
 import pytest
 
@@ -76,3 +77,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         terminalreporter.section("measured")
         for what, value in sorted(stated):
             terminalreporter.write_line(f"{what}: {value}")
+
+
+# A run in the background ignores Ctrl-C, and so would the programs that tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
