@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import signal
+import signal
+from collections.abc import Callable
 from typing import Any
 
-import Callable
 import numpy as np
 import pytest
 
