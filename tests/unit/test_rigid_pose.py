@@ -6,7 +6,7 @@ import pytest
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.rigid import Knowledge, RigidStatus, solve_rigid
-from rfpose.multilat.rigid.integers import solve_ladder
+from rfpose.multilat.rigid.integers import common_offset, solve_ladder
 
 RNG = np.random.default_rng(1)
 TRANSMITTER = np.column_stack([RNG.uniform(-100, 100, (8, 2)), RNG.uniform(20, 50, 8)])
@@ -84,3 +84,19 @@ def test_bad_arguments():
         solve(np.zeros((1, 1, 3, 5)))
     with pytest.raises(InvalidInputError, match="observations"):
         solve_ladder(TRANSMITTER, PLACES[None], [], start_pivot_enu_m=PIVOT, start_rot_enu_from_mirror=ROT)
+
+
+def test_offsets_a_whole_number_of_every_wavelength_apart_are_one_answer():
+    """Carriers on a raster of 200 MHz repeat every 1.5 m: the receiver's clock takes that up, no integer is at risk."""
+    rng = np.random.default_rng(3)
+    speed, offset_m = 299_792_458.0, 0.2
+    for carrier_hz, is_safe in (
+        (8.2e9 + 0.4e9 * np.arange(10), True),  # on a raster
+        (8.2e9 + 1e6 * np.arange(10), False),  # so close together that neighbouring offsets fit alike
+    ):
+        wavelength = speed / carrier_hz
+        left = offset_m + 1e-4 * rng.standard_normal((5, 3, 10)) + wavelength * rng.integers(-50, 50, (5, 3, 10))
+        found, risk = common_offset(left, wavelength, np.full(left.shape, 1e-4))
+        assert np.all(risk < 1e-9) == is_safe
+        if is_safe:
+            np.testing.assert_allclose(found[..., 0], offset_m, atol=6e-4 / np.sqrt(10))

@@ -38,6 +38,9 @@ _SAFE_ROUNDING = 1e-6
 _DECIDING_TURN_RAD = 0.3
 """A turn less certain than this leaves each candidate's pose several minima: residuals do not decide between them."""
 
+_SAME_TURN = 1e-6
+"""Offsets that differ by whole wavelengths to this part of one are the same [cycles]."""
+
 _UNLIKELY = 1e-6
 """Residuals rarer than this are worth another start."""
 
@@ -470,7 +473,8 @@ def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -
     """Return the common offset of ranges known up to whole wavelengths, per receiver, and the risk of a wrong one.
 
     With one wavelength the offset is near zero; any multiple of it does as well. With unequal wavelengths (carriers)
-    it is the one within ±`DELAY_REACH_M` that fits best, and the runner-up tells how safely.
+    it is the one within ±`DELAY_REACH_M` that fits best, and the runner-up tells how safely. Offsets that are a whole
+    number of every wavelength apart (carriers on a common raster) are one answer; the one nearest zero is given.
 
     Parameters
     ----------
@@ -505,8 +509,13 @@ def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -
     best = np.argmin(score, axis=0)[None]
     chosen = np.take_along_axis(all_offsets, best[..., None], axis=0)[0]
     lowest = np.take_along_axis(score, best, axis=0)
-    # several beginnings end at the same offset; the runner-up is the best of the others
-    apart = np.abs(all_offsets - chosen)[..., 0] > 0.25 * float(np.min(wavelength))
+    # Several beginnings end at the same offset, or a whole number of every wavelength from it, which the receiver's
+    # unknown clock takes up: both are the same answer. The runner-up is the best of the others.
+    turns = (all_offsets - chosen) / wavelength
+    same = np.where(seen, np.abs(turns - np.rint(turns)), 0.0).max(axis=3) < _SAME_TURN
+    nearest = np.argmin(np.where(same, np.abs(all_offsets[..., 0]), np.inf), axis=0)[None]
+    chosen = np.take_along_axis(all_offsets, nearest[..., None], axis=0)[0]
+    apart = ~same & (np.abs(all_offsets - chosen)[..., 0] > 0.25 * float(np.min(wavelength)))
     with np.errstate(invalid="ignore"):
         odds = np.where(apart, np.exp(-0.5 * np.minimum(score - lowest, 1400.0)), 0.0).sum(axis=0)
     return chosen, np.nan_to_num(np.minimum(odds, 1.0), nan=1.0)
