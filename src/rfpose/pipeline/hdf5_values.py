@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -10,22 +9,12 @@ import numpy as np
 
 from rfpose.recording.hdf5 import FROM_SAMPLES, find_dataset
 
-__all__ = ["DAMAGES", "array_of", "format_of", "text_of"]
+__all__ = ["DAMAGES", "array_of", "text_of"]
 
 DAMAGES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError, OverflowError, MemoryError)
 """What h5py and numpy raise where a file is not what it says."""
 
 _LARGEST = 1e50
-
-
-def format_of(path: str | Path) -> str | None:
-    """Return the ``format`` that an HDF5 file gives itself; None for whatever cannot be opened or has none."""
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format")
-    except DAMAGES:
-        return None
-    return found if isinstance(found, str) else None
 
 
 def text_of(file: h5py.File, place: str) -> str:

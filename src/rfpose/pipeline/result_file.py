@@ -21,12 +21,12 @@ from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
 from rfpose.files import write_atomically
-from rfpose.kinds import told_kind
+from rfpose.kinds import kind_of, told_kind
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
+from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
 from rfpose.pipeline.result import (
     LAST_TIME_S,
     DelayTable,
@@ -233,7 +233,7 @@ def _write(file: h5py.File, path: str, values: npt.ArrayLike) -> None:
 
 def is_result(path: str | Path) -> bool:
     """Tell whether a file says that it is an rfpose-result; false for whatever cannot be opened."""
-    return format_of(path) == FORMAT
+    return kind_of(path) == "result"
 
 
 def read_result(path: str | Path) -> Result:

@@ -26,8 +26,8 @@ from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
-from rfpose.kinds import told_kind
-from rfpose.pipeline.hdf5_values import DAMAGES, array_of, format_of, text_of
+from rfpose.kinds import kind_of, told_kind
+from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
 from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.recording.hdf5 import find_item
@@ -307,7 +307,7 @@ def _texts(file: h5py.File, place: str, texts: tuple[str, ...]) -> None:
 
 def is_track(path: str | Path) -> bool:
     """Tell whether a file says that it is an rfpose-tracking; false for whatever cannot be opened."""
-    return format_of(path) == FORMAT
+    return kind_of(path) == "track"
 
 
 def read_track(path: str | Path) -> Track:
