@@ -19,7 +19,7 @@ from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels
 from rfpose.dsp.plan import LinePlan
 
-__all__ = ["Inspection", "LineBank", "LineStreams", "inspect"]
+__all__ = ["ClockRange", "Inspection", "LineBank", "LineStreams", "inspect"]
 
 ComplexArray = npt.NDArray[np.complex128]
 Samples = npt.NDArray[np.int16] | npt.NDArray[np.float32]
@@ -48,6 +48,13 @@ class Inspection(NamedTuple):
     fill: int
     zero: int
     not_finite: int
+
+
+class ClockRange(NamedTuple):
+    """How far a receiver's clock may be off, and how far from where it is assumed [ppm]."""
+
+    largest_ppm: float
+    error_ppm: float
 
 
 Fold = Callable[[Samples, int, npt.NDArray[np.float32]], Inspection]
@@ -141,9 +148,9 @@ class LineBank:
     windowed
         False: blocks without overlap and flat weights (for a joint least-squares fit of all lines, which needs no
         stop band). True: overlapping blocks under a window (each line filtered by itself).
-    clock_range_ppm
-        How far the receiver's clock may be from where it is assumed [ppm]; the better it is known, the longer are the
-        flat blocks and the less is left to do after them. None: as far as the plan searches.
+    clock
+        What is known of the receiver's clock; the more, the longer are the flat blocks and the less is left to do after
+        them. None: nothing yet.
     full_scale
         Component magnitude at which a sample counts as clipped [counts].
     """
@@ -154,13 +161,13 @@ class LineBank:
         n_sample: int,
         *,
         windowed: bool,
-        clock_range_ppm: float | None = None,
+        clock: ClockRange | None = None,
         full_scale: float = np.inf,
     ) -> None:
         self.plan = plan
         self.n_sample = n_sample
         self.full_scale = float(full_scale)
-        n_tap = _window_length(plan, n_sample) if windowed else _block_length(plan, n_sample, clock_range_ppm)
+        n_tap = _window_length(plan, n_sample) if windowed else _block_length(plan, n_sample, clock)
         self.window = _window(plan, n_tap) if windowed else BOXCAR
         overlap = _OVERLAP[self.window]
         self.period, self.n_fold = _folding(plan.grid, n_tap, overlap)
@@ -264,20 +271,20 @@ def _window(plan: LinePlan, n_tap: int) -> tuple[float, ...]:
     return HANN if gap_bins >= _HANN_GAP_BINS else NUTTALL
 
 
-def _block_length(plan: LinePlan, n_sample: int, clock_range_ppm: float | None) -> int:
-    """Flat blocks: long enough to be cheap, short enough that an unknown clock does not turn a line away.
+def _block_length(plan: LinePlan, n_sample: int, clock: ClockRange | None) -> int:
+    """Flat blocks: long enough to be cheap, short enough that the clock does not turn a line away from its template.
 
-    A line turning 0.04 cycles inside a block loses 0.3 % of its power to the template.
+    About the assumed clock the band's centre stands still, and its edges turn most: by 0.02 cycles, which costs the
+    outermost line 0.13 % of its power. The error of the assumed clock turns all lines.
     """
-    if clock_range_ppm is None:
-        # about the assumed clock the band's centre stands still, and its edges turn most
-        slope, shortest_count, longest = 0.5e-6 * plan.clock_search_ppm, 16, _LONGEST_BLOCK
-    else:
-        slope = float(np.max(np.abs(plan.cycles_per_ppm()))) * clock_range_ppm
-        # without a common grid a block is not folded, and a longer one costs as much a sample
-        shortest_count, longest = 64, _LONGEST_BLOCK if plan.grid is None else _LONGEST_FOLDED_BLOCK
-    by_clock = 0.04 / slope if slope > 0 else np.inf
-    return int(max(16, min(longest, by_clock, n_sample // shortest_count)))
+    if clock is None:
+        by_clock = 0.04 / max(0.5e-6 * plan.clock_search_ppm, 1e-12)
+        return int(max(16, min(_LONGEST_BLOCK, by_clock, n_sample // 16)))
+    by_edge = 0.02 / max(0.5e-6 * clock.largest_ppm, 1e-12)
+    by_error = 0.04 / max(float(np.max(np.abs(plan.cycles_per_ppm()))) * clock.error_ppm, 1e-12)
+    # without a common grid a block is not folded, and a longer one costs as much a sample
+    longest = _LONGEST_BLOCK if plan.grid is None else _LONGEST_FOLDED_BLOCK
+    return int(max(16, min(longest, by_edge, by_error, n_sample // 64)))
 
 
 def _window_length(plan: LinePlan, n_sample: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels, hilbert
-from rfpose.dsp.bank import Inspection, LineBank, LineStreams, inspect
+from rfpose.dsp.bank import ClockRange, Inspection, LineBank, LineStreams, inspect
 from rfpose.dsp.clock import coarse_clock_ppm, refine_clock
 from rfpose.dsp.correlator import fit_lines
 from rfpose.dsp.plan import LinePlan
@@ -26,6 +27,8 @@ ESTIMATORS = ("hilbert", "correlator", "dot", "dot-compensated")
 _MAX_CLIPPED_FRACTION = 1e-4
 _CLOCK_DRIFT_PPM = 0.5
 """How far a clock may wander from where it was acquired before it is acquired anew."""
+_CLOCK_CLASS_PPM = 2.5
+"""Receivers whose clocks are off by as much, in such steps, share a line bank."""
 _LINEAR_STEP_SIGMA = 3.0
 """A step of the clock within so many sigma bends the lines less than the noise does: it needs no second fit."""
 _CARRIER_POWER_SNR = 25.0
@@ -60,16 +63,20 @@ class ToneExtractor:
         self.plan = plan
         self.estimator = estimator
         self.full_scale = float(full_scale)
-        self._bank = lru_cache(maxsize=4)(self._make_bank)
+        self._bank = lru_cache(maxsize=16)(self._make_bank)
         self._search_bank = lru_cache(maxsize=4)(self._make_search_bank)
         self._drift_ppm = min(_CLOCK_DRIFT_PPM, plan.clock_search_ppm)
 
-    def _make_bank(self, n_sample: int) -> LineBank:
+    def _bank_at(self, n_sample: int, clock_ppm: float) -> LineBank:
+        """Return the bank for frames of a receiver whose clock is followed."""
+        return self._bank(n_sample, _CLOCK_CLASS_PPM * math.ceil((abs(clock_ppm) + self._drift_ppm) / _CLOCK_CLASS_PPM))
+
+    def _make_bank(self, n_sample: int, largest_ppm: float) -> LineBank:
         return LineBank(
             self.plan,
             n_sample,
             windowed=self.estimator != "correlator",
-            clock_range_ppm=self._drift_ppm,
+            clock=ClockRange(largest_ppm, self._drift_ppm),
             full_scale=self.full_scale,
         )
 
@@ -114,10 +121,10 @@ class ToneExtractor:
             Samples of another shape or type, or fewer than 64.
         """
         x = _as_samples(samples)
-        bank = self._bank(len(x))
         start_ppm = self.acquire_clock(x) if clock_ppm is None or not np.isfinite(clock_ppm) else float(clock_ppm)
         # a frame whose samples are bad has no clock; its samples are looked at all the same
-        streams = bank.streams(x, start_ppm if np.isfinite(start_ppm) else 0.0)
+        assumed_ppm = start_ppm if np.isfinite(start_ppm) else 0.0
+        streams = self._bank_at(len(x), assumed_ppm).streams(x, assumed_ppm)
         fault, clipped = _fault(streams.inspection, len(x)), streams.inspection.clipped / len(x)
         if fault is not LineStatus.OK:
             return FrameTones.failed(self.plan.n_transmitter, self.plan.n_tone, fault, clipped_fraction=clipped)
@@ -126,7 +133,7 @@ class ToneExtractor:
             # the lines do not add up: either all is noise, or the clock has jumped
             again = self.acquire_clock(x)
             if abs(again - ppm) > self._drift_ppm:
-                streams = bank.streams(x, again)
+                streams = self._bank_at(len(x), again).streams(x, again)
                 ppm, curvature, _ = refine_clock(streams, self.plan, again, self._drift_ppm)
         streams = streams.at_clock(self.plan, ppm)
         if self.estimator != "correlator":
