@@ -172,7 +172,7 @@ def test_file_that_vanishes_and_one_that_grows_are_said(
     path.unlink()
     wait(window, lambda: "has vanished" in window.session.message.text)
     window.reload()
-    wait(window, lambda: "cannot read" in window.session.message.text)
+    wait(window, lambda: "cannot be read" in window.session.message.text)
     assert window.session.document is not None
 
 
