@@ -245,6 +245,8 @@ class _Lines:
         text, began, done, total, at = self._state
         if not done:
             return f"{text}, for {_duration(time.monotonic() - began)}"
+        if done >= total:  # what is found is being put together
+            return f"{text}: all {total} done, finishing for {_duration(time.monotonic() - at)}"
         left = max(0.0, (at - began) * (total / done - 1.0) - (time.monotonic() - at))
         return f"{text}: {done} of {total}, {_duration(left)} left"
 
