@@ -2,58 +2,137 @@
 
 Kernels take arrays and scalars and give arrays back; they do not check, read, write, raise or draw random
 numbers. A public function in front of each checks, shapes and names.
+
+Numba itself takes half a second to load. It is loaded when the first kernel is called, so that what calls none (help,
+a refusal, most of ``rfpose info``) does not wait for it.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
+import threading
 from collections.abc import Callable
 from typing import Any
 
-import numba
-from numba.core import event
-
-__all__ = ["kernel", "kernel_fast", "kernel_inline", "kernel_parallel", "kernel_parallel_fast"]
+__all__ = [
+    "Kernel",
+    "kernel",
+    "kernel_fast",
+    "kernel_inline",
+    "kernel_parallel",
+    "kernel_parallel_fast",
+    "load_numba",
+    "prange",
+]
 
 Function = Callable[..., Any]
-
-# OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
 
 # Reordering and contraction let sums vectorise. "nnan" and "ninf" stay off: NaN is a mark here.
 _REORDER = {"reassoc", "contract", "arcp", "nsz"}
 _COMMON: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 
-
 _log = logging.getLogger(__name__)
 
 
-def kernel(function: Function) -> Function:
+def kernel(function: Function) -> Kernel:
     """Compile a serial kernel with IEEE arithmetic."""
-    return _compiled(function)
+    return Kernel(function)
 
 
-def kernel_inline(function: Function) -> Function:
+def kernel_inline(function: Function) -> Kernel:
     """Compile a small piece that is inlined into the kernels that call it."""
-    return _compiled(function, inline="always")
+    return Kernel(function, inline="always")
 
 
-def kernel_parallel(function: Function) -> Function:
-    """Compile a kernel whose ``numba.prange`` loops run on all cores."""
-    return _compiled(function, parallel=True)
+def kernel_parallel(function: Function) -> Kernel:
+    """Compile a kernel whose ``prange`` loops run on all cores."""
+    return Kernel(function, parallel=True)
 
 
-def kernel_fast(function: Function) -> Function:
+def kernel_fast(function: Function) -> Kernel:
     """Compile a serial kernel whose sums may be reordered; NaN keeps its meaning."""
-    return _compiled(function, fastmath=_REORDER)
+    return Kernel(function, fastmath=_REORDER)
 
 
-def kernel_parallel_fast(function: Function) -> Function:
+def kernel_parallel_fast(function: Function) -> Kernel:
     """Compile a parallel kernel whose sums may be reordered; NaN keeps its meaning."""
-    return _compiled(function, parallel=True, fastmath=_REORDER)
+    return Kernel(function, parallel=True, fastmath=_REORDER)
 
 
-def _compiled(function: Function, **options: Any) -> Function:
+prange = range
+"""In a kernel: a loop that runs on all cores; numba's own takes this name's place before anything is compiled."""
+
+
+class Kernel:
+    """A function that numba gets to see when it is first called.
+
+    Attributes
+    ----------
+    py_func
+        The function as it was written, for its twin in tests.
+    """
+
+    def __init__(self, function: Function, **options: Any) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self.options = options
+        self.compiled: Function | None = None
+        _unbound.append(self)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Run the compiled function."""
+        if self.compiled is None:
+            _bind()
+        assert self.compiled is not None
+        return self.compiled(*arguments)
+
+
+_unbound: list[Kernel] = []
+_lock = threading.RLock()
+
+
+def _bind() -> None:
+    """Hand every kernel that was written down so far to numba.
+
+    Compiled code looks its callees up among the globals of its module, so there each kernel makes room for what numba
+    made of it.
+    """
+    with _lock:
+        numba = load_numba()
+        made = list(_unbound)
+        for one in made:
+            one.compiled = _compiled(numba, one.py_func, one.options)
+        for one in made:
+            names = one.py_func.__globals__
+            for name, value in list(names.items()):
+                if isinstance(value, Kernel) and value.compiled is not None:
+                    names[name] = value.compiled
+                elif value is prange:
+                    names[name] = numba.prange
+        del _unbound[: len(made)]
+
+
+@functools.cache
+def load_numba() -> Any:
+    """Load numba and set what holds for all kernels."""
+    import numba
+    from numba.core import event
+
+    class Listener(event.Listener):
+        def on_start(self, event: event.Event) -> None:
+            _teller.hear(event.data["dispatcher"].py_func.__module__)
+
+        def on_end(self, event: event.Event) -> None:
+            pass
+
+    # OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
+    event.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
+    return numba
+
+
+def _compiled(numba: Any, function: Function, options: dict[str, Any]) -> Function:
     """Hand a function to numba, with its cache if there is a place for it."""
     try:
         return numba.njit(**_COMMON, **options)(function)  # type: ignore[no-any-return]
@@ -65,16 +144,16 @@ def _compiled(function: Function, **options: Any) -> Function:
     return numba.njit(**_COMMON | {"cache": False}, **options)(function)  # type: ignore[no-any-return]
 
 
-class _Teller(event.Listener):
+class _Teller:
     """Says once in a process that it compiles; what comes out of the cache is not compiled."""
 
     def __init__(self) -> None:
         self.can_keep = True
         self._told = False
 
-    def on_start(self, event: event.Event) -> None:
-        """Hear that a function is about to be compiled."""
-        if self._told or not event.data["dispatcher"].py_func.__module__.startswith("rfpose."):
+    def hear(self, module: str) -> None:
+        """Take note that a function of a module is about to be compiled."""
+        if self._told or not module.startswith("rfpose."):
             return
         self._told = True
         _log.info("compiling kernels, once; this takes up to a minute or two")
@@ -84,9 +163,5 @@ class _Teller(event.Listener):
                 "NUMBA_CACHE_DIR to a directory that can"
             )
 
-    def on_end(self, event: event.Event) -> None:
-        """Nothing to say."""
-
 
 _teller = _Teller()
-event.register("numba:compile", _teller)  # type: ignore[no-untyped-call]

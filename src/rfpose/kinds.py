@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-__all__ = ["FORMAT_KINDS", "kind_of", "told_kind"]
+from rfpose.errors import RecordingError
+
+__all__ = ["FORMAT_KINDS", "check_kind", "kind_of", "told_kind"]
 
 FORMAT_KINDS = {
     "rfpose-iq": "recording",
@@ -23,6 +25,7 @@ _WORDS = {
     "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
     "truth": "a truth, which `rfpose evaluate --truth` takes",
 }
+_MADE = {"result": ("result", "`rfpose process`"), "track": ("tracking run", "`rfpose track`")}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
@@ -60,6 +63,25 @@ def _kind_of_hdf5(path: Path) -> str | None:
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):
         return None
     return FORMAT_KINDS.get(found) if isinstance(found, str) else None
+
+
+def check_kind(path: str | Path, *, wanted: str) -> None:
+    """Refuse what is no ``result`` or no ``track`` by its beginning, before anything is loaded to read it.
+
+    Raises
+    ------
+    RecordingError
+        Missing, another kind of file, or none that is known.
+    """
+    path = Path(path)
+    name, maker = _MADE[wanted]
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file; make it with {maker}")
+    kind = kind_of(path)
+    if kind is None:
+        raise RecordingError(f"{path}: no {name}, but truncated or another kind of file; run {maker} again")
+    if kind != wanted:
+        raise RecordingError(f"{path}: no {name}, but {_WORDS[kind]}; give what {maker} wrote")
 
 
 def told_kind(path: str | Path, *, wanted: str) -> str:

@@ -41,6 +41,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 COMPILED = ("numba", "scipy", "pvlib", "matplotlib", "PySide6")
+NO_KERNEL = ("numba", "scipy.stats", "scipy.ndimage", "matplotlib", "PySide6", "pydantic")
 
 
 @pytest.mark.parametrize(
@@ -66,6 +67,16 @@ COMPILED = ("numba", "scipy", "pvlib", "matplotlib", "PySide6")
         ("process bare.h5 -o x.h5", "holds no scenario", COMPILED),
         ("process bare.h5 --scenario bad.toml -o x.h5", "not valid TOML", COMPILED),
         ("convert absent.h5 -o x.h5", "no such file", COMPILED),
+        ("evaluate there.h5", "no result", HEAVY),
+        ("calibrate bad.toml", "is no directory", HEAVY),
+        ("info there.h5", "the file is empty", COMPILED),
+        ("info bad.toml", "not valid TOML", COMPILED),
+        ("view there.h5 --save x.png", "the file is empty", COMPILED),
+        ("view bad.toml --save x.png", "not valid TOML", COMPILED),
+        ("view there.h5 --scenario bad.toml --save x.png", "the file is empty", COMPILED),
+        ("aim bad.toml --dish --start 2026-06-21T06:00Z", "not valid TOML", NO_KERNEL),
+        ("calibrate .", "no heliostat folder", NO_KERNEL),
+        ("calibrate --mount bad.toml --drone there", "not valid TOML", NO_KERNEL),
     ],
 )
 def test_a_refusal_waits_for_nothing_heavy(tmp_path: Path, words: str, says: str, unloaded: tuple[str, ...]) -> None:

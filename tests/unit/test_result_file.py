@@ -135,14 +135,14 @@ def test_documentation_names_every_key() -> None:
 def test_truncated(path: Path, kept: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
-    with pytest.raises(RecordingError, match=r"result\.h5: cannot be read as HDF5.*process again"):
+    with pytest.raises(RecordingError, match=r"result\.h5: no result, but truncated.*run `rfpose process` again"):
         read_result(path)
     assert not is_result(path)
 
 
 def test_not_hdf5(tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_text("a letter")
-    with pytest.raises(RecordingError, match=r"a\.h5: cannot be read as HDF5"):
+    with pytest.raises(RecordingError, match=r"a\.h5: no result, but.* another kind of file"):
         read_result(tmp_path / "a.h5")
 
 
@@ -154,7 +154,7 @@ def test_absent(tmp_path: Path) -> None:
 def test_hdf5_of_another_kind(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["x"] = 1
-    with pytest.raises(RecordingError, match=r"a\.h5: is no rfpose-result file"):
+    with pytest.raises(RecordingError, match=r"a\.h5: no result, but.* another kind of file"):
         read_result(tmp_path / "a.h5")
     assert not is_result(tmp_path / "a.h5")
 

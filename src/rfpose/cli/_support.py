@@ -21,7 +21,9 @@ from rfpose.files import claim
 __all__ = [
     "Progress",
     "Session",
+    "check_directory",
     "check_ending",
+    "check_readable",
     "check_scenario",
     "check_there",
     "common_options",
@@ -149,6 +151,27 @@ def check_there(*paths: Path | None) -> None:
     for path in paths:
         if path is not None and not path.exists():
             raise RecordingError(f"{path}: no such file or directory; check the path")
+
+
+def check_readable(path: Path, *, follow_links: bool = False) -> None:
+    """Refuse what is nothing of ours, or cannot be opened, before all is loaded that shows it."""
+    from rfpose.kinds import kind_of
+
+    check_there(path)
+    kind = kind_of(path)
+    if kind == "scenario" or (kind is None and path.suffix == ".toml"):
+        check_scenario(path)
+    elif kind is None:
+        from rfpose.recording import open_recording
+
+        open_recording(path, follow_links=follow_links).close()
+
+
+def check_directory(path: Path | None) -> None:
+    """Refuse what is no directory before anything is loaded to read it."""
+    check_there(path)
+    if path is not None and not path.is_dir():
+        raise RecordingError(f"{path}: is no directory; give the folder that holds the heliostats' folders")
 
 
 def check_scenario(path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rfpose.cli._support import (
+    check_directory,
     check_ending,
     check_there,
     common_options,
@@ -98,6 +99,7 @@ def command(
     inputs = [directory, mounts, *radio, motors, camera, drone]
     with outputs(output, picture, inputs=inputs, force=force), progress("Fitting"):
         check_there(*inputs)
+        check_directory(directory)
         from rfpose.feedback.mount import PARAMETERS
         from rfpose.pipeline.calibrate import draw_errors, write_models
 

@@ -44,8 +44,10 @@ def command(result: Path, truth: Path | None, follow_links: bool) -> None:
     Errors are of the mirror normal; the beam's are twice that.
     """
     from rfpose.errors import RecordingError
+    from rfpose.kinds import check_kind
 
-    check_there(result, truth)
+    check_kind(result, wanted="result")
+    check_there(truth)
     with progress("Evaluating"):
         from rfpose.pipeline.result_file import read_result
 

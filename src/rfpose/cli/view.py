@@ -8,6 +8,8 @@ import click
 
 from rfpose.cli._support import (
     check_ending,
+    check_readable,
+    check_scenario,
     check_there,
     common_options,
     emit_json,
@@ -76,7 +78,10 @@ def command(
         raise click.UsageError("--save needs a FILE to draw")
     check_ending(save, ".png", ".svg", ".html")
     with outputs(save, inputs=[file, scenario], force=force), progress("Drawing"):
-        check_there(file, scenario)
+        check_readable(file, follow_links=follow_links)
+        if scenario is not None:
+            check_there(scenario)
+            check_scenario(scenario)
         from rfpose.viewer.app import check_installed
         from rfpose.viewer.export import export
 

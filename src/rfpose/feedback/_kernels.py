@@ -13,10 +13,9 @@ point, sigma of the normal [rad], 1 if the row is the receiver plane's normal an
 
 import math
 
-import numba as nb
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 N_PARAMETER = 34
 N_CONSTANT = 26
@@ -147,7 +146,7 @@ def _residuals(p, k, count, row, use, out):
 def residuals_batch(p, k, count, row, use):
     """Residuals of many heliostats (heliostat, measurement, xyz), in sigma."""
     out = np.empty((len(p), row.shape[1], 3))
-    for h in nb.prange(len(p)):
+    for h in prange(len(p)):
         _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
     return out
 
@@ -156,7 +155,7 @@ def residuals_batch(p, k, count, row, use):
 def jacobian_batch(p, k, count, row, use, free, scale):
     """Central differences of the residuals by free parameters, (heliostat, measurement, xyz, parameter)."""
     out = np.empty((len(p), row.shape[1], 3, len(free)))
-    for h in nb.prange(len(p)):
+    for h in prange(len(p)):
         trial = p[h].copy()
         high = np.empty((row.shape[1], 3))
         low = np.empty((row.shape[1], 3))
@@ -177,7 +176,7 @@ def jacobian_batch(p, k, count, row, use, free, scale):
 def posture_batch(p, k, count, receiver):
     """Axis angles, normal and centre (heliostat, posture, 8)."""
     out = np.empty((len(p), count.shape[1], 8))
-    for h in nb.prange(len(p)):
+    for h in prange(len(p)):
         prepared = np.empty(_N_PREPARED)
         _prepare(p[h], k[h], prepared)
         for i in range(count.shape[1]):
@@ -267,7 +266,7 @@ def command_batch(p, k, row):
     n = row.shape[1]
     out = np.full((len(p), n, 2), np.nan)
     status = np.empty((len(p), n), np.int8)
-    for h in nb.prange(len(p)):
+    for h in prange(len(p)):
         prepared = np.empty(_N_PREPARED)
         state = np.empty(6)
         moved = np.empty(6)
@@ -449,7 +448,7 @@ def fit_batch(start, k, count, row, use, free, scale, low, high, mean, weight, h
     p = start.copy()
     iterations = np.empty(len(p), np.int64)
     noise = np.empty(len(p))
-    for h in nb.prange(len(p)):
+    for h in prange(len(p)):
         done, sigma = _fit_one(
             p[h], k[h], count[h], row[h], use[h], free, scale, low[h], high[h], mean[h], weight,
             huber, sigma_known, max_iteration,

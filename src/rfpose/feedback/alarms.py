@@ -14,7 +14,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
 
 from rfpose.checks import FloatArray, as_positive
 from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
@@ -123,6 +122,8 @@ def _cuts(series: npt.NDArray[np.float64], limit: float, least: int) -> list[int
     n = len(series)
     if n < 2 * least:
         return []
+    from scipy.ndimage import median_filter  # as theilslopes below, slow to load
+
     x = median_filter(series, size=3, mode="nearest")
     sigma = 1.4826 * float(np.median(np.abs(np.diff(series)))) / np.sqrt(2.0)
     penalty = least * max(limit, 3.0 * sigma) ** 2

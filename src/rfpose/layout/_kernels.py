@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 # Smallest share of an unknown's information that the others may leave before it counts as unobserved.
 FLOOR = 1e-13
@@ -238,7 +237,7 @@ def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
 @kernel_parallel
 def dop_rows(transmitter, weight, visible, point, n_chunk, out):
     """Dilution of position, plane and height of each point, (3, point), per unit of one transmitter's range sigma."""
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         begin, end = span(chunk, n_chunk, point.shape[0])
         dop_rows_part(begin, end, transmitter, weight, visible, point, out)
 
@@ -331,7 +330,7 @@ def tilt_independent(field, plane_slope, own, common, n_min, n_chunk, out):
 
     ``own``, ``common`` (group, transmitter): variances of a receiver's own noise and of the calibration's.
     """
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         begin, end = span(chunk, n_chunk, field.pivot.shape[0])
         tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, out)
 
@@ -500,7 +499,7 @@ def tilt_calibrated(field, weight, shared, pivot_info, roll_info, n_chunk, out):
     ``weight`` (transmitter,) is the sum over tones. Clocks, one a receiver or one a mirror (``shared``), come off as
     means, the pivot as a block: far less arithmetic than `tilt_rigid`, and the same result.
     """
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         begin, end = span(chunk, n_chunk, field.pivot.shape[0])
         tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_info, out)
 
@@ -613,7 +612,7 @@ def tilt_rigid(field, weight, bias_info, group_class, n_class, shared, tie, pivo
     (infinite = perfectly calibrated, 0 = not at all). ``shared``: one clock a mirror and class; else one a receiver,
     whose differences have information ``tie`` a pair.
     """
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         begin, end = span(chunk, n_chunk, field.pivot.shape[0])
         tilt_rigid_part(
             begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out

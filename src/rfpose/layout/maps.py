@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +16,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.dsp.bounds import phase_bound_rad
 from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.jit import load_numba
 from rfpose.layout import _kernels
 from rfpose.scenario import Heliostat, Scenario
 
@@ -727,7 +727,7 @@ def summarise(values: FloatArray) -> dict[str, float]:
 
 def _chunks(n: int) -> int:
     """Pieces to share out: one a thread for small maps, more for large ones."""
-    return max(1, min(8 * numba.get_num_threads(), n // 64 or 1))
+    return max(1, min(8 * int(load_numba().get_num_threads()), n // 64 or 1))
 
 
 def _mask(visible: npt.ArrayLike | None, shape: tuple[int, ...], lead: tuple[int, ...]) -> npt.NDArray[np.uint8]:

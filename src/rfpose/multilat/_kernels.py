@@ -16,12 +16,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -545,7 +544,7 @@ def locate_rows(
     n = range_difference.shape[0]
     n_transmitter = transmitter.shape[0]
     n_group = (n + LANES - 1) // LANES
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         ws = np.zeros(WORKSPACE)
         delta = np.zeros((n_transmitter, LANES))
         w = np.zeros((n_transmitter, LANES))

@@ -29,10 +29,7 @@ from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.foreign import load_toml, read_text
-from rfpose.multilat import PoseStatus
 from rfpose.pipeline.mount_file import MountFile, StoredMount
-from rfpose.pipeline.result import frame_time
-from rfpose.pipeline.result_file import read_result
 
 __all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 
@@ -77,6 +74,11 @@ def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) 
     within_s
         A log entry further from the frame than this does not count [s].
     """
+    # a result's reader takes longer to load than a PAINT directory to read
+    from rfpose.multilat import PoseStatus
+    from rfpose.pipeline.result import frame_time
+    from rfpose.pipeline.result_file import read_result
+
     log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for row in _rows(motors, ("time_utc", "heliostat", "axis_1", "axis_2")):
         log[row.text["heliostat"]].append((row.unix_s, row.number("axis_1"), row.number("axis_2")))

@@ -9,15 +9,10 @@ from typing import Any
 
 from rfpose.errors import GeometryError, RecordingError, ScenarioError
 from rfpose.kinds import kind_of
-from rfpose.pipeline.choice import POSES
-from rfpose.pipeline.mount_file import read_models
-from rfpose.pipeline.result import frame_time
-from rfpose.pipeline.result_file import read_result
-from rfpose.pipeline.result_summary import summarise
-from rfpose.pipeline.solve import check_solvable
-from rfpose.pipeline.track_file import read_track
 from rfpose.recording import describe, open_recording
 from rfpose.scenario import Scenario, load_scenario
+
+# each kind loads its reader when one of it is there: a reader of results or runs takes longer to load than to read
 
 __all__ = ["inspect_file"]
 
@@ -57,6 +52,9 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
 
 
 def _scenario(scenario: Scenario) -> dict[str, Any]:
+    from rfpose.pipeline.choice import POSES
+    from rfpose.pipeline.solve import check_solvable
+
     problems = []
     try:
         check_solvable(scenario, pose=POSES[0])
@@ -83,6 +81,10 @@ def _scenario(scenario: Scenario) -> dict[str, Any]:
 
 
 def _result(path: Path) -> dict[str, Any]:
+    from rfpose.pipeline.result import frame_time
+    from rfpose.pipeline.result_file import read_result
+    from rfpose.pipeline.result_summary import summarise
+
     result = read_result(path)
     starts = result.frame_start_index
     times = [frame_time(int(starts[i]), result.sample_rate).isoformat() for i in (0, -1)] if len(starts) else [None] * 2
@@ -103,6 +105,8 @@ def _result(path: Path) -> dict[str, Any]:
 
 
 def _track(path: Path) -> dict[str, Any]:
+    from rfpose.pipeline.track_file import read_track
+
     track = read_track(path)
     times = [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[:: max(len(track.unix_s) - 1, 1)]]
     unscored = [name for name, method in track.methods.items() if method.summary["normal_mrad"]["rms"] is None]
@@ -132,6 +136,8 @@ def _track(path: Path) -> dict[str, Any]:
 
 
 def _models(path: Path) -> dict[str, Any]:
+    from rfpose.pipeline.mount_file import read_models
+
     content = read_models(path)
     site = content.site
     problems = [

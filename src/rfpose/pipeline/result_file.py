@@ -21,7 +21,7 @@ from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
 from rfpose.files import write_atomically
-from rfpose.kinds import kind_of, told_kind
+from rfpose.kinds import check_kind, kind_of
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -246,10 +246,7 @@ def read_result(path: str | Path) -> Result:
         shape, or says what no result says; the message names the file and the place.
     """
     path = Path(path)
-    if not path.exists():
-        raise RecordingError(f"{path}: no such file; make it with `rfpose process`")
-    if instead := told_kind(path, wanted="result"):
-        raise RecordingError(f"{path}: no result, but {instead}; give what `rfpose process` wrote")
+    check_kind(path, wanted="result")
     try:
         with h5py.File(path, "r") as file:
             return _Reader(path, file).result()
@@ -270,9 +267,6 @@ class _Reader:
         self._length: dict[str, int] = {}
 
     def result(self) -> Result:
-        found = self._file.attrs.get("format")
-        if found != FORMAT:
-            raise self._error(f"is no {FORMAT} file (format: {found or 'none'})", "give what `rfpose process` wrote")
         version = self._file.attrs.get("version")
         if version != VERSION:
             raise self._error(f"has version {version} of {FORMAT}, this rfpose reads {VERSION}", "process again")

@@ -26,7 +26,7 @@ from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
-from rfpose.kinds import kind_of, told_kind
+from rfpose.kinds import check_kind, kind_of
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
 from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
@@ -320,14 +320,11 @@ def read_track(path: str | Path) -> Track:
         what no run says; the message names the file and the place.
     """
     path = Path(path)
-    if not path.exists():
-        raise RecordingError(f"{path}: no such file; make it with `rfpose track`")
-    if instead := told_kind(path, wanted="track"):
-        raise RecordingError(f"{path}: no tracking run, but {instead}; give what `rfpose track` wrote")
+    check_kind(path, wanted="track")
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT or file.attrs.get("version") != VERSION:
-                raise RecordingError(f"{path}: is no {FORMAT} of version {VERSION}; make it with `rfpose track`")
+            if file.attrs.get("version") != VERSION:
+                raise RecordingError(f"{path}: is no {FORMAT} of version {VERSION}; {_AGAIN}")
             return _Reader(path, file).track()
     except RecordingError:
         raise

@@ -10,12 +10,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.jit import load_numba
 from rfpose.scenario import Receiver, Scenario
 from rfpose.simulate import _draws, _kernels, _motion, _rays
 from rfpose.truth import Truth
@@ -167,7 +167,7 @@ class Simulator:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield the samples in order; a few chunks ahead are made on other cores meanwhile."""
-        n_worker = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        n_worker = int(load_numba().config.NUMBA_NUM_THREADS)
         ahead: deque[Future[list[Chunk]]] = deque()
         with ThreadPoolExecutor(n_worker, thread_name_prefix="rfpose-simulate") as pool:
             for job in self._jobs():

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
-from rfpose.jit import kernel_inline, kernel_parallel
+from rfpose.jit import kernel_inline, kernel_parallel, prange
 
 # state of one axis
 INTEGRAL, WANTED, MOTOR, AXIS, GOAL, LAST = 0, 1, 2, 3, 4, 5
@@ -135,7 +134,7 @@ def servo_field(command, measured, feed, state, count, law, drive, dt):
 
     ``command`` and ``measured`` [rad], NaN where unknown; ``feed`` the speed known beforehand [rad/s].
     """
-    for i in nb.prange(len(command)):
+    for i in prange(len(command)):
         s = state[i]
         speed, s[INTEGRAL] = law_step(command[i] - measured[i], s[INTEGRAL], law, dt)
         s[WANTED] += (speed + feed[i]) * dt
@@ -152,7 +151,7 @@ def loop_run(command, disturbance, keep, now, before, row, delay, law, drive, ha
     intervals pass from measurement to speed, and the rest of the latency sits between ``before`` and ``now``.
     """
     n_order = len(row)
-    for i in nb.prange(command.shape[0]):
+    for i in prange(command.shape[0]):
         x = np.zeros(n_order)
         moved = np.zeros(n_order)
         line = np.zeros(delay + 1)

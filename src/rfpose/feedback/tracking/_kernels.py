@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 
 from rfpose.feedback._kernels import _axis, _bisector, _command_one, _posture, _prepare
 from rfpose.feedback.servo._kernels import law_step, stepper_step
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
@@ -636,7 +635,7 @@ def advance(
     """
     n = p.shape[0]
     share = max(n // N_BLOCK, 1)
-    for block in nb.prange((n + share - 1) // share):
+    for block in prange((n + share - 1) // share):
         advance_some(
             block * share, min((block + 1) * share, n),
             loop, law, drive_1, drive_2, table,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numba as nb
-
-from rfpose.jit import kernel_parallel
+from rfpose.jit import kernel_parallel, prange
 
 
 @kernel_parallel
@@ -15,7 +13,7 @@ def filter_gusts(state, keep, kick, n_plain, slow, noise, out):
     and follows them by ``slow`` a step.
     """
     n = keep.shape[0]
-    for h in nb.prange(state.shape[0]):
+    for h in prange(state.shape[0]):
         for t in range(noise.shape[1]):
             plain = 0.0
             quick = 0.0

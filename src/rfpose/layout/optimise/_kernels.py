@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 from rfpose.layout._kernels import FLOOR, directions, invert, look, span, torque, turn_slopes
 
 DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
@@ -71,7 +70,7 @@ def objective_rows(method, field, weight, plane_slope, n_chunk, value, gradient)
     ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
     Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
     """
-    for chunk in numba.prange(n_chunk):
+    for chunk in prange(n_chunk):
         begin, end = span(chunk, n_chunk, field.pivot.shape[0])
         objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient)
 

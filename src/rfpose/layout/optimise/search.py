@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
@@ -16,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.jit import load_numba
 from rfpose.layout.maps import Mirrors, _chunks, _field, _plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
@@ -179,6 +179,7 @@ def _rows(
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Search on one core: a few hundred points and tiny matrices, where threads only wait for each other."""
+    numba = load_numba()
     before = numba.get_num_threads()
     numba.set_num_threads(1)
     try:

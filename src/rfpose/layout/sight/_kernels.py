@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numba
-
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 
 @kernel
@@ -103,7 +101,7 @@ def visible_rows(
 ):
     """Fill ``out`` (row, receiver, transmitter) with one where the way is free; row i belongs to plate ``who[i]``."""
     n_row, n_receiver, n_transmitter = out.shape
-    for i in numba.prange(n_row):
+    for i in prange(n_row):
         m = who[i]
         for r in range(n_receiver):
             ax, ay, az = receiver[i, r, 0], receiver[i, r, 1], receiver[i, r, 2]

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 # fates of a row; `rfpose.multilat.ambiguity.IntegerStatus` gives them names
 OK = 0
@@ -205,7 +204,7 @@ def fix_one(n, value, cov, limit, integers, norm):
 @kernel_parallel
 def fix_many(count, value, cov, limit, integers, norm, risk, adop, n_found, status):
     """`fix_one` for every row; row m has ``count[m]`` unknowns, its first ones."""
-    for m in numba.prange(len(count)):
+    for m in prange(len(count)):
         if count[m] == 0:
             status[m] = NONE
             continue
@@ -241,7 +240,7 @@ def difference_many(
     (−1: none) and the difference of transmitter ``reference[m, r, 1]`` at receiver ``reference[m, r, 0]`` (−1: none).
     """
     n_receiver, n_transmitter = left.shape[1:]
-    for m in numba.prange(len(left)):
+    for m in prange(len(left)):
         size = n_receiver * n_transmitter
         receivers, transmitters = np.empty((size, 4), np.int64), np.empty((size, 4), np.int64)
         signs, n_term = np.empty((size, 4)), np.empty(size, np.int64)

@@ -18,11 +18,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 from rfpose.multilat.rigid._kernels import add_priors, factor, rotate, solve_factored
 
 Float64 = npt.NDArray[np.float64]
@@ -212,7 +211,7 @@ def shift_at(scene, work, x, y, z, i, out):
 @kernel_parallel
 def shifts_at_points(scene, point, out):
     """`shift_at` for points (point, 3): ``out`` (point, transmitter, group, 4 + parameter)."""
-    for m in numba.prange(point.shape[0]):
+    for m in prange(point.shape[0]):
         work = _work(scene.image.shape[0])
         for i in range(out.shape[1]):
             shift_at(scene, work, point[m, 0], point[m, 1], point[m, 2], i, out[m, i])
@@ -531,7 +530,7 @@ def fit_many(
     status,
 ):
     """`_fit_from_turns` for every mirror that has a start."""
-    for index in numba.prange(chi2.shape[0]):
+    for index in prange(chi2.shape[0]):
         m = np.int64(index)  # one type for both passes of the compiler
         if status[m] <= 2:
             chi2[m], n_iteration[m], status[m] = _fit_from_turns(
@@ -555,7 +554,7 @@ def fit_many(
 @kernel_parallel
 def predict_many(scene, frame, receiver_mirror, pivot, rot, predicted, slope):
     """`predict` for every mirror."""
-    for m in numba.prange(pivot.shape[0]):
+    for m in prange(pivot.shape[0]):
         common = scene.common[frame[m]]
         work = _work(scene.image.shape[0])
         predict(scene, common, work, receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 from rfpose.multilat.rigid._kernels import factor, ranges_and_slopes, solve_factored
 
 
@@ -237,7 +236,7 @@ def judge_many(
     data_info, data_gradient, cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,
 ):  # fmt: skip
     """`_judge_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
-    for m in numba.prange(z.shape[0]):
+    for m in prange(z.shape[0]):
         ok[m] = _judge_one(
             transmitter, places[m], z[m], weight[m], bias_info[m], clock_class, prior_info[m], pivot[m], rot[m],
             clock[m], floor, data_info[m], data_gradient[m], cov[m], stat[m], dof[m], hidden[m], shift[m], spread[m],

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 
 
 @kernel
@@ -326,7 +325,7 @@ def solve_many(
     status,
 ):
     """`_solve_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
-    for m in numba.prange(z.shape[0]):
+    for m in prange(z.shape[0]):
         if status[m] != 0:
             continue
         chi2[m], n_iteration[m], status[m] = _solve_one(
@@ -371,7 +370,7 @@ def covariance_many(
     n_receiver = receiver_mirror.shape[1]
     n_class = clock_own.shape[1]
     n = 6 + n_class * n_receiver
-    for m in numba.prange(weight.shape[0]):
+    for m in prange(weight.shape[0]):
         distance = np.empty((n_receiver, transmitter.shape[0]))
         slope = np.empty((n_receiver, transmitter.shape[0], 6))
         info = np.zeros((n, n))

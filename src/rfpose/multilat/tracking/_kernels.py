@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel
+from rfpose.jit import kernel, kernel_parallel, prange
 from rfpose.multilat.rigid._kernels import rotate
 
 N = 9
@@ -236,7 +235,7 @@ def track_many(
     distance, parts,
 ):  # fmt: skip
     """`step_frame` for every frame of every mirror; results ``delay`` after each frame's ``time``."""
-    for m in numba.prange(measured_pivot.shape[1]):
+    for m in prange(measured_pivot.shape[1]):
         for f in range(len(time)):
             status[f, m], distance[f, m], parts[f, m] = step_frame(
                 measured_pivot[f, m], measured_rot[f, m], noise[f, m], usable[f, m], exposure, walk_rate, walk_pivot,
