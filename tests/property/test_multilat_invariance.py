@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rfpose.multilat import locate, mirror_normal
+from rfpose.multilat import FixStatus, locate, mirror_normal
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -81,7 +81,10 @@ def test_every_receiver_of_the_field_is_found_from_a_cold_start(sigma, missing):
     ranges = measure(rng, receiver, sigma)
     np.put_along_axis(ranges, np.argsort(rng.random(ranges.shape), axis=1)[:, :missing], np.nan, axis=1)
     fixes = locate(TRANSMITTER, ranges, sigma_m=sigma, max_dop=np.inf)
-    assert fixes.ok.all()
+    # with five transmitters a second place may fit as well; one in ten thousand does
+    two_places = (fixes.status == FixStatus.AMBIGUOUS) & (missing == 5)
+    assert np.all(fixes.ok | two_places)
+    assert np.count_nonzero(two_places) <= 3
     offset = fixes.position_enu_m - receiver
     limit = 8.0 * np.sqrt(np.trace(fixes.cov_enu_m2, axis1=1, axis2=2))
     if missing == 5:  # dilution to 100 and more: first-order covariance, and the mirror image nearby

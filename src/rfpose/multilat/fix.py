@@ -164,10 +164,10 @@ def locate(
         On which side of the transmitters' plane receivers are KNOWN to be; one for all or one a receiver. Transmitters
         of similar height have a second solution near the mirror image in their plane, which noise can make the better
         one. The solution on the known side is taken unless it is a million times less likely than noise or the other
-        side would have it; of two there (a plane that leans), the better one, which is not marked. None: nothing is
-        known, and the better one counts; where neither wins (`DECISIVE_CHI2`) it is the lower one and the row is
-        AMBIGUOUS. In two dimensions, where that
-        means a line, nothing is known. Without effect with a given start.
+        side would have it; of two there (a plane that leans), the better one, which is not marked but where a row
+        has one transmitter more than it takes. None: nothing is known, and the better one counts; where neither wins
+        (`DECISIVE_CHI2`) it is the lower one and the row is AMBIGUOUS. In two dimensions, where that means a line,
+        nothing is known. Without effect with a given start.
     max_iteration
         Gauss-Newton steps before a row is given up (twice as many, half as long, from other starts).
     min_probability
@@ -381,11 +381,31 @@ def _choose_side(
     have two solutions that fit alike.
     """
     ambiguous = np.zeros(len(ranges), np.bool_)
-    place = result["position_enu_m"]
     rows, image = _images(problem, weight, result, known)
+    _choose(problem, ranges, weight, result, known, rows, image, ambiguous)
+    # with one transmitter more than it takes, a second solution need not be near an image
+    scarce = result["n_transmitter"] == problem.transmitter.shape[1] + 2
+    rows = np.flatnonzero(scarce & (result["status"] == FixStatus.OK))
+    for start in problem.other_starts(result["position_enu_m"][rows])[1:] if rows.size else ():
+        _choose(problem, ranges, weight, result, known, rows, start, ambiguous)
+    return ambiguous
+
+
+def _choose(
+    problem: _Problem,
+    ranges: FloatArray,
+    weight: FloatArray,
+    result: dict[str, npt.NDArray[Any]],
+    known: FloatArray,
+    rows: IndexArray,
+    start: FloatArray,
+    ambiguous: npt.NDArray[np.bool_],
+) -> None:
+    """Solve some rows from another start; where that leads elsewhere, keep the right one and note what fits alike."""
     if not rows.size:
-        return ambiguous
-    again = problem.solve(ranges[rows], _rows_of(weight, rows), image, relax=RESTART_RELAX)
+        return
+    place = result["position_enu_m"]
+    again = problem.solve(ranges[rows], _rows_of(weight, rows), start, relax=RESTART_RELAX)
     here, there = place[rows], again["position_enu_m"]
     apart = here - there
     with np.errstate(invalid="ignore"):
@@ -395,16 +415,17 @@ def _choose_side(
         limit = _chi2_limit(again["n_transmitter"], place.shape[1], SIDE_PROBABILITY)
         sign = known[rows]
         right, other_right = (sign * problem.height(p) >= 0.0 for p in (here, there))
-        alike = (np.abs(gain) <= DECISIVE_CHI2) & (sign == 0.0)
+        scarce = again["n_transmitter"] == place.shape[1] + 2
+        alike = (np.abs(gain) <= DECISIVE_CHI2) & ((sign == 0.0) | scarce)
         lower = there[:, -1] < here[:, -1] if place.shape[1] == 3 else gain > 0.0
     both = right == other_right
     sure = -2.0 * np.log(SIDE_PROBABILITY)
     likely = ((again["chi2"] <= limit) & (gain > -sure)) | (gain > 0.0)
-    better = other & np.where(both, np.where(alike, lower, gain > 0.0), np.where(right, gain > sure, likely))
-    ambiguous[rows] = other & both & alike
+    wins = np.where(alike & (sign == 0.0), lower, gain > 0.0)
+    better = other & np.where(both, wins, np.where(right, gain > sure, likely))
+    ambiguous[rows] |= other & both & alike
     for name, array in again.items():
         result[name][rows[better]] = array[better]
-    return ambiguous
 
 
 def _rows_of(weight: FloatArray, rows: IndexArray) -> FloatArray:
