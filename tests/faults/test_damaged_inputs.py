@@ -2,6 +2,8 @@
 
 import contextlib
 import json
+import re
+import shutil
 from pathlib import Path
 
 import h5py
@@ -12,13 +14,15 @@ import tomli_w
 from damage import as_json, copied, damage_bytes, damage_hdf5, damage_values
 from paint_files import write_json, write_paint
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.feedback.camera.render import Beam, Target, View, render
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.series import Quantity, read_series_csv
+from rfpose.feedback.sun import Site
 from rfpose.layout.fields import read_positions
 from rfpose.pipeline.aim import plan_commands
 from rfpose.pipeline.calibrate import calibrate_paint, write_models
-from rfpose.pipeline.calibration_sources import read_drone, read_radio
+from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_radio
 from rfpose.pipeline.evaluate import evaluate, read_truth
 from rfpose.pipeline.field_view import field_of_result, field_of_scenario, history
 from rfpose.pipeline.inspect import inspect_file
@@ -360,3 +364,53 @@ def test_damaged_tables_of_motors_and_drones(files, tmp_path, seed):
             refused(path, readers[name], how)
         except Exception as error:
             raise AssertionError(f"seed {seed}, {k}, {name}, {how}: {error!r}") from error
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from skimage import io
+
+    folder = tmp_path_factory.mktemp("pictures")
+    picture = render(Target(), View(), (Beam(centre_m=(0.2, 0.1)),), rng=np.random.default_rng(1))
+    io.imsave(folder / "1.png", picture, check_contrast=False)
+    (folder / "pictures.csv").write_text(
+        "file,time_utc,heliostat,axis_1,axis_2\n1.png,2026-06-21T08:00:00Z,A,0.1,0.3\n"
+    )
+    board = {"centre_enu_m": [0.0, 0.0, 12.0], "normal_enu": [0.0, 1.0, 0.0], "mm_per_px": 2.0, "spot_sigma_m": 0.002}
+    (folder / "board.toml").write_text(tomli_w.dumps(board))
+    return folder
+
+
+def read_pictures(folder: Path) -> object:
+    site = Site(latitude_rad=0.66, longitude_rad=-0.04, altitude_m=500.0)
+    return read_camera(folder, {"A": Mount(pivot_enu_m=np.array([0.0, 80.0, 3.0]))}, site)
+
+
+@pytest.mark.parametrize("name", ["pictures.csv", "board.toml", "1.png"])
+def test_damaged_pictures(pictures, tmp_path, name):
+    assert read_pictures(pictures)
+    rng = np.random.default_rng(5)
+    odd = ("", "nan", "1e999", "x" * 500, "-1e300", "[[1,2]]", "'b'", "0", "-1")
+    for k in range(25):
+        shutil.copytree(pictures, tmp_path / f"{k}")
+        path = tmp_path / f"{k}" / name
+        if name == "1.png" or k % 2:
+            how = damage_bytes(path, rng)
+        else:
+            words = re.split(r"([,\s=\[\]]+)", path.read_text())
+            at = 2 * int(rng.integers(len(words) // 2))
+            words[at] = how = odd[k // 2 % len(odd)]
+            path.write_text("".join(words))
+        try:
+            refused(path.parent, read_pictures, how)
+        except Exception as error:
+            raise AssertionError(f"{k}, {name}, {how}: {error!r}") from error
+
+
+def test_pictures_outside_their_folder_are_not_read(pictures, tmp_path):
+    shutil.copytree(pictures, tmp_path / "sent")
+    shutil.copy(pictures / "1.png", tmp_path / "mine.png")
+    table = tmp_path / "sent" / "pictures.csv"
+    table.write_text(table.read_text().replace("1.png", "../mine.png"))
+    with pytest.raises(RfposeError, match=r"mine\.png"):
+        read_pictures(tmp_path / "sent")

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from rfpose.checks import as_positive
+from rfpose.checks import as_float_array, as_positive
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.camera.malan import Board, find_spot
 from rfpose.feedback.camera.model import spot_sigma_rad, spots_enu_m
@@ -209,7 +209,10 @@ def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) ->
     left_out = {}
     parts: dict[str, list[list[float]]] = defaultdict(list)
     for row in _rows(folder / PICTURES_NAME, ("file", "time_utc", "heliostat", "axis_1", "axis_2")):
-        spot = find_spot(read_picture(folder / row.text["file"]), board)
+        picture = folder / row.text["file"]
+        if not picture.resolve().is_relative_to(folder.resolve()):  # a folder from elsewhere reads no file of ours
+            raise RecordingError(f"{folder / PICTURES_NAME}: names {picture}, outside the folder; copy it there")
+        spot = find_spot(read_picture(picture), board)
         if spot.status != SpotStatus.OK:
             left_out[row.text["file"]] = f"{spot.status.name.lower().replace('_', ' ')}: {spot.text}"
             continue
@@ -222,13 +225,18 @@ def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) ->
     for name, rows in parts.items():
         table = np.array(rows)
         distance = np.linalg.norm(table[:, 3:6] - _pivot(folder, mounts, name), axis=1)
-        made[name] = Measurements.from_spots(
-            table[:, 1:3],
-            sun_enu=sun_position(table[:, 0], site).direction_enu,
-            spot_enu_m=table[:, 3:6],
-            sigma_rad=spot_sigma_rad(spot_sigma_m, distance),
-            unix_s=table[:, 0],
-        )
+        try:
+            made[name] = Measurements.from_spots(
+                table[:, 1:3],
+                sun_enu=sun_position(table[:, 0], site).direction_enu,
+                spot_enu_m=table[:, 3:6],
+                sigma_rad=spot_sigma_rad(spot_sigma_m, distance),
+                unix_s=table[:, 0],
+            )
+        except RfposeError as error:
+            raise RecordingError(
+                f"{folder}: heliostat {name}: {error}; see {BOARD_NAME} and {PICTURES_NAME}"
+            ) from error
     return Gathered(source="camera", measurements=made, left_out=left_out)
 
 
@@ -238,7 +246,11 @@ def _board(path: Path) -> tuple[list[float], list[float], Board, float]:
         raise RecordingError(f"{path}: is missing; it says where the target stands and where its markers are")
     table = load_toml(path)
     try:
-        centre, normal = table.pop("centre_enu_m"), table.pop("normal_enu")
+        centre, normal = (
+            as_float_array(name, table.pop(name), (3,)).tolist() for name in ("centre_enu_m", "normal_enu")
+        )
+        if not any(normal):
+            raise InvalidInputError("`normal_enu` must have a direction, got 0, 0, 0")
         sigma = as_positive("spot_sigma_m", table.pop("spot_sigma_m", _SPOT_SIGMA_M))
         board = Board(**{key: _tuples(value) for key, value in table.items()})
     except KeyError as error:

@@ -195,7 +195,7 @@ def test_right_and_up_of_a_target_in_the_site():
         (lambda: View(front_m=-1.0), "front_m"),
         (lambda: View(shape_px=(1, 5)), "shape_px"),
         (lambda: Board(mm_per_px=0.0), "mm_per_px"),
-        (lambda: Board(corners_px=((0.0, 0.0),)), "four points"),
+        (lambda: Board(corners_px=((0.0, 0.0),)), r"shape \(4, 2\)"),
         (lambda: find_spot(np.zeros(5)), "row, column"),
         (lambda: find_spot(np.zeros((50, 50), np.int64)), "8 or 16 bits"),
         (lambda: spiral_offsets_m(0.0, n_ring=1), "side_m"),

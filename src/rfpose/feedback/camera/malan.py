@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray, as_positive, read_only
+from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.camera.spot import LEAST_PX, Spot, SpotStatus, as_grey, no_spot, skimage
 
@@ -21,6 +21,7 @@ __all__ = ["Board", "beam_threshold", "find_spot", "marker_threshold", "weighted
 
 Mask = npt.NDArray[np.bool_]
 
+_MOST_PIXELS = 10_000  # a side; more is no camera's, but a typing error that takes all memory
 _ALIKE = 4.0
 _LEAST_CONTRAST = 20.0
 _SATURATED_PART = 0.3
@@ -62,10 +63,15 @@ class Board:
     def __post_init__(self) -> None:
         for name in ("width_m", "height_m", "mm_per_px"):
             as_positive(name, getattr(self, name))
+        pixels = 1e3 * max(self.width_m, self.height_m) / self.mm_per_px
+        if not 10.0 <= pixels <= _MOST_PIXELS:
+            raise InvalidInputError(
+                f"`mm_per_px` must make 10 to {_MOST_PIXELS} pixels of the target, got {self.mm_per_px!r}"
+            )
         for name in ("marker_centres_m", "corners_px"):
             value = getattr(self, name)
-            if value is not None and np.shape(value) != (4, 2):
-                raise InvalidInputError(f"`{name}` must be four points of two numbers, got shape {np.shape(value)}")
+            if value is not None:
+                as_float_array(name, value, (4, 2))
 
 
 def marker_threshold(darkest: float, lightest: float) -> float:
