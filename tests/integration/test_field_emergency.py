@@ -20,7 +20,7 @@ def _field(n, **changes):
     return Field(pivot_enu_m=ring_field(n), receiver=receiver, **changes)
 
 
-def _play(field, times, *, happenings, mode=Mode.TRACK, bus=None, settings=None, wind_m_s=0.0, seed=1):
+def _play(field, times, *, happenings, mode=Mode.TRACK, bus=None, settings=None, wind_mps=0.0, seed=1):
     control = FieldControl(
         aim_enu_m=field.receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,
@@ -31,7 +31,7 @@ def _play(field, times, *, happenings, mode=Mode.TRACK, bus=None, settings=None,
         rng=np.random.default_rng(seed),
     )
     sun = sun_position(NOON_S + times, SITE).direction_enu
-    return play(control, field, time_s=times, sun_enu=sun, wind_m_s=wind_m_s, happenings=happenings)
+    return play(control, field, time_s=times, sun_enu=sun, wind_mps=wind_mps, happenings=happenings)
 
 
 def _alarm_with_a_dead_cluster(control):
@@ -81,7 +81,7 @@ def test_flux_comes_back_on_approach_and_goes_with_the_wind():
         _field(64),
         times,
         mode=Mode.STOW,
-        wind_m_s=wind,
+        wind_mps=wind,
         happenings={2.0: lambda control: control.command(Event.APPROACH)},
     )
     assert got.flux[:5].max() < 1e-6

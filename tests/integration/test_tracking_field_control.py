@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rfpose.cli.track import _event
+from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import Simulation, operation, score
@@ -86,8 +87,8 @@ def test_a_day_goes_from_stow_to_stow_the_safe_way(whole_day, method):
     curves, day = whole_day.curves(method), whole_day.days[0]
     works = day.works[::4]
     on = Mode.POINT if method == "open-loop" else Mode.TRACK
-    per_rad = whole_day.field.constant[:, 13:15]
-    home = whole_day.field.constant[:, 15:17].copy()
+    per_rad = constant(whole_day.field.constant, "counts_per_unit")
+    home = constant(whole_day.field.constant, "angle_at_zero_rad").copy()
     for i in range(3):
         want = ["STOW", "APPROACH", "POINT", "TRACK", "STOWING", "STOW"]
         want.remove("TRACK" if method == "open-loop" else "POINT")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rfpose.feedback import _kernels
 from rfpose.feedback.calibration import PARAMETER_SETS, fit, fit_many, posture_jacobian
+from rfpose.feedback.columns import CONSTANTS, P, constant
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, posture
 
@@ -91,9 +91,42 @@ def test_jacobian_is_the_differences_of_the_twin():
         np.testing.assert_allclose(got[..., f], want, rtol=2e-6, atol=2e-7 * max(1.0, np.abs(want).max()), err_msg=name)
 
 
-def test_kernels_agree_on_the_number_of_parameters():
-    assert len(PARAMETERS) == _kernels.N_PARAMETER
-    assert len(Mount(pivot_enu_m=np.zeros(3)).constant_vector()) == _kernels.N_CONSTANT
+def test_columns_are_where_mounts_have_them():
+    shape = {"stroke_m": 0.08, "radius_m": 0.338, "offset_m": 0.335}
+    mount = Mount(
+        pivot_enu_m=np.array([1.0, 2.0, 3.0]),
+        rot_enu_from_mount=LEVEL,
+        actuators=(
+            Actuator(counts_per_unit=4.0, angle_at_zero_rad=5.0, worm_ratio=6.0, limits_count=(7.0, 8.0)),
+            Actuator(kind="linear", sign=-1, counts_per_unit=9.0, angle_at_zero_rad=10.0, worm_ratio=11.0,
+                     limits_count=(12.0, 13.0), **shape),
+        ),
+        parameters={name: float(i) for i, name in enumerate(PARAMETERS) if not name.startswith("actuator")},
+    )  # fmt: skip
+    parameters, constants = mount.parameter_vector(), mount.constant_vector()
+    assert len(parameters) == len(PARAMETERS)
+    assert len(constants) == sum(CONSTANTS.values())
+    for name, value in mount.parameters.items():
+        assert parameters[getattr(P, name)] == value
+    expected = {
+        "rot_enu_from_mount": LEVEL.ravel(), "is_linear": (0, 1), "sign": (1, -1), "counts_per_unit": (4, 9),
+        "angle_at_zero_rad": (5, 10), "worm_ratio": (6, 11), "pivot_enu_m": (1, 2, 3), "lowest_count": (7, 12),
+        "highest_count": (8, 13),
+    }  # fmt: skip
+    assert list(expected) == list(CONSTANTS)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(constant(constants, name), values, err_msg=name)
+
+
+def test_columns_of_axes_are_spaced_as_kernels_step_through_them():
+    # kernels add the axis, for a worm twice the axis, and count through xyz
+    for name, other in zip(PARAMETERS, list(PARAMETERS)[1:], strict=False):
+        if "_1_" in name and not name.startswith("worm"):
+            assert other == name.replace("_1_", "_2_")
+    assert P.worm_2_sin_rad - P.worm_1_sin_rad == P.worm_2_cos_rad - P.worm_1_cos_rad == 2
+    for part in ("location", "drone_camera"):
+        east, north, up = (getattr(P, f"{part}_{axis}_m") for axis in ("east", "north", "up"))
+        assert (north, up) == (east + 1, east + 2)
 
 
 def test_batch_is_one_by_one():

@@ -1,26 +1,18 @@
 """Kernels of the mount and of its calibration.
 
-One heliostat is two rows of numbers. ``p`` (N_PARAMETER) is what a calibration may change, in the order of
-``rfpose.feedback.mount.PARAMETERS``; ``k`` (N_CONSTANT) is what it may not:
-
-    0:9    rotation of the nominal mount frame into ENU, by rows      9, 10   actuator kind: 0 rotary, 1 linear
-    11, 12 sign of the axis angle   13, 14 counts per rad or per m    15, 16  axis angle at count zero [rad]
-    17, 18 worm gear ratio          19:22  nominal pivot ENU [m]      22:26   lowest, highest count of axis 1, axis 2
-
-A measurement is a row ``m`` (N_ROW): source xyz, 1 if the source is a point, target xyz, 1 if the target is a
-point, sigma of the normal [rad], 1 if the row is the receiver plane's normal and not the mirror's.
+One heliostat is two rows of numbers: ``p``, what a calibration may change, and ``k``, what it may not. A measurement is
+a row ``m``. `rfpose.feedback.columns` names their columns: P, K and M.
 """
 
 import math
 
 import numpy as np
 
+from rfpose.feedback.columns import MEASUREMENT, K, M, P
 from rfpose.jit import kernel, kernel_parallel, prange
 
-N_PARAMETER = 34
-N_CONSTANT = 26
-N_ROW = 10
-_N_PREPARED = 16
+N_ROW = sum(MEASUREMENT.values())
+N_PREPARED = 16
 # Median of a Rayleigh variable in units of its sigma: the residual has two components.
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
@@ -38,32 +30,39 @@ def _opening(length, radius, offset):
 @kernel
 def _prepare(p, k, out):
     """What does not depend on the posture: rotation (9), pivot (3), opening angles at count zero (2)."""
-    cn, sn = math.cos(p[0]), math.sin(p[0])
-    ce, se = math.cos(p[1]), math.sin(p[1])
-    ct, st = math.cos(p[2]), math.sin(p[2])
+    cn, sn = math.cos(p[P.pedestal_tilt_north_rad]), math.sin(p[P.pedestal_tilt_north_rad])
+    ce, se = math.cos(p[P.pedestal_tilt_east_rad]), math.sin(p[P.pedestal_tilt_east_rad])
+    ct, st = math.cos(p[P.pedestal_twist_rad]), math.sin(p[P.pedestal_twist_rad])
     for j in range(3):
-        x, y, z = k[j], k[3 + j], k[6 + j]
+        x, y, z = k[K.rot_enu_from_mount + j], k[K.rot_enu_from_mount + 3 + j], k[K.rot_enu_from_mount + 6 + j]
         x, y = ct * x + st * y, ct * y - st * x  # twist, clockwise from above
         y, z = cn * y + sn * z, cn * z - sn * y  # tilt towards north
         x, z = ce * x + se * z, ce * z - se * x  # tilt towards east
         out[j], out[3 + j], out[6 + j] = x, y, z
-    length = p[11]
-    out[9] = k[19] + p[8] + length * se * cn
-    out[10] = k[20] + p[9] + length * sn
-    out[11] = k[21] + p[10] + length * (ce * cn - 1.0)
+    length = p[P.pylon_length_m]
+    out[9] = k[K.pivot_enu_m] + p[P.location_east_m] + length * se * cn
+    out[10] = k[K.pivot_enu_m + 1] + p[P.location_north_m] + length * sn
+    out[11] = k[K.pivot_enu_m + 2] + p[P.location_up_m] + length * (ce * cn - 1.0)
     for a in range(2):
-        out[12 + a] = _opening(p[18 + a], p[20 + a], p[22 + a]) if k[9 + a] > 0.5 else 0.0
+        out[12 + a] = (
+            _opening(p[P.actuator_1_stroke_m + a], p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a])
+            if k[K.is_linear + a] > 0.5
+            else 0.0
+        )
 
 
 @kernel
 def _axis(a, count, p, k, prepared):
     """Angle of axis ``a`` at a motor position."""
-    travel = count / k[13 + a] * (1.0 + p[16 + a])
-    if k[9 + a] > 0.5:
-        travel = _opening(p[18 + a] + travel, p[20 + a], p[22 + a]) - prepared[12 + a]
-    angle = k[15 + a] + k[11 + a] * travel + p[3 + a]
-    turn = k[17 + a] * angle
-    s, c = p[24 + 2 * a], p[25 + 2 * a]
+    travel = count / k[K.counts_per_unit + a] * (1.0 + p[P.axis_1_gain + a])
+    if k[K.is_linear + a] > 0.5:
+        travel = (
+            _opening(p[P.actuator_1_stroke_m + a] + travel, p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a])
+            - prepared[12 + a]
+        )
+    angle = k[K.angle_at_zero_rad + a] + k[K.sign + a] * travel + p[P.axis_1_zero_rad + a]
+    turn = k[K.worm_ratio + a] * angle
+    s, c = p[P.worm_1_sin_rad + 2 * a], p[P.worm_1_cos_rad + 2 * a]
     if s != 0.0 or c != 0.0:
         angle += s * math.sin(turn) + c * math.cos(turn)
     return angle
@@ -74,16 +73,16 @@ def _posture(azimuth, elevation, p, prepared, receiver, out):
     """Mirror normal (3) and centre (3) in ENU at two axis angles."""
     sa, ca = math.sin(azimuth), math.cos(azimuth)
     se, ce = math.sin(elevation), math.cos(elevation)
-    sd, cd = math.sin(p[5]), math.cos(p[5])
+    sd, cd = math.sin(p[P.nonorthogonality_rad]), math.cos(p[P.nonorthogonality_rad])
     # canting in the mirror frame: towards right, towards up
-    across = p[7] + receiver * p[30]
-    along = p[6] + receiver * p[29]
+    across = p[P.canting_right_rad] + receiver * p[P.receiver_plane_right_rad]
+    along = p[P.canting_up_rad] + receiver * p[P.receiver_plane_up_rad]
     inverse = 1.0 / math.sqrt(1.0 + across * across + along * along)
     for which in range(2):
         if which == 0:
             r, up, n, ahead = across * inverse, along * inverse, inverse, 0.0
         else:
-            r, up, n, ahead = p[14], p[13], p[12], p[15]
+            r, up, n, ahead = p[P.arm_right_m], p[P.arm_up_m], p[P.arm_normal_m], p[P.axis_offset_m]
         # frame of axis 1: right, forward, up; then axis 2's non-orthogonality, about forward
         f = ce * n - se * up
         u = se * n + ce * up
@@ -94,7 +93,7 @@ def _posture(azimuth, elevation, p, prepared, receiver, out):
         for i in range(3):
             value = prepared[3 * i] * x + prepared[3 * i + 1] * y + prepared[3 * i + 2] * u
             out[3 * which + i] = value + (prepared[9 + i] if which == 1 else 0.0)
-    sag = p[28]
+    sag = p[P.gravity_sag_rad]
     if sag != 0.0:
         z = out[2]
         x, y, z = out[0] * (1.0 + sag * z), out[1] * (1.0 + sag * z), z * (1.0 + sag * z) - sag
@@ -105,10 +104,13 @@ def _posture(azimuth, elevation, p, prepared, receiver, out):
 @kernel
 def _bisector(m, centre, out):
     """Normal that sends the row's source to its target from a mirror centre."""
-    length_s = 0.0
-    length_t = 0.0
-    s0, s1, s2 = m[0] - m[3] * centre[0], m[1] - m[3] * centre[1], m[2] - m[3] * centre[2]
-    t0, t1, t2 = m[4] - m[7] * centre[0], m[5] - m[7] * centre[1], m[6] - m[7] * centre[2]
+    from_point, to_point = m[M.source_is_point], m[M.target_is_point]
+    s0 = m[M.source_enu] - from_point * centre[0]
+    s1 = m[M.source_enu + 1] - from_point * centre[1]
+    s2 = m[M.source_enu + 2] - from_point * centre[2]
+    t0 = m[M.target_enu] - to_point * centre[0]
+    t1 = m[M.target_enu + 1] - to_point * centre[1]
+    t2 = m[M.target_enu + 2] - to_point * centre[2]
     length_s = math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
     length_t = math.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
     x = s0 / length_s + t0 / length_t
@@ -121,7 +123,7 @@ def _bisector(m, centre, out):
 @kernel
 def _residuals(p, k, count, row, use, out):
     """Modelled minus measured normal over sigma, (measurement, xyz); zero where not used."""
-    prepared = np.empty(_N_PREPARED)
+    prepared = np.empty(N_PREPARED)
     state = np.empty(6)
     wanted = np.empty(3)
     seen = np.empty(N_ROW)
@@ -132,14 +134,14 @@ def _residuals(p, k, count, row, use, out):
             continue
         azimuth = _axis(0, count[i, 0], p, k, prepared)
         elevation = _axis(1, count[i, 1], p, k, prepared)
-        _posture(azimuth, elevation, p, prepared, row[i, 9], state)
+        _posture(azimuth, elevation, p, prepared, row[i, M.of_receiver_plane], state)
         for j in range(N_ROW):
             seen[j] = row[i, j]
         for j in range(3):  # a drone's camera sits beside its antenna
-            seen[j] += seen[3] * p[31 + j]
+            seen[M.source_enu + j] += seen[M.source_is_point] * p[P.drone_camera_east_m + j]
         _bisector(seen, state[3:], wanted)
         for j in range(3):
-            out[i, j] = (state[j] - wanted[j]) / row[i, 8]
+            out[i, j] = (state[j] - wanted[j]) / row[i, M.sigma_rad]
 
 
 @kernel_parallel
@@ -177,7 +179,7 @@ def posture_batch(p, k, count, receiver):
     """Axis angles, normal and centre (heliostat, posture, 8)."""
     out = np.empty((len(p), count.shape[1], 8))
     for h in prange(len(p)):
-        prepared = np.empty(_N_PREPARED)
+        prepared = np.empty(N_PREPARED)
         _prepare(p[h], k[h], prepared)
         for i in range(count.shape[1]):
             out[h, i, 0] = _axis(0, count[h, i, 0], p[h], k[h], prepared)
@@ -189,15 +191,15 @@ def posture_batch(p, k, count, receiver):
 @kernel
 def _count_guess(a, angle, p, k, prepared):
     """Motor position for an axis angle, worm gear left out; NaN where the actuator cannot reach it."""
-    travel = (angle - k[15 + a] - p[3 + a]) * k[11 + a]
-    if k[9 + a] > 0.5:
+    travel = (angle - k[K.angle_at_zero_rad + a] - p[P.axis_1_zero_rad + a]) * k[K.sign + a]
+    if k[K.is_linear + a] > 0.5:
         opening = travel + prepared[12 + a]
         if opening < 0.0 or opening > math.pi:
             return np.nan
-        radius, offset = p[20 + a], p[22 + a]
+        radius, offset = p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a]
         square = offset * offset + radius * radius - 2.0 * offset * radius * math.cos(opening)
-        travel = math.sqrt(max(square, 0.0)) - p[18 + a]
-    return travel / (1.0 + p[16 + a]) * k[13 + a]
+        travel = math.sqrt(max(square, 0.0)) - p[P.actuator_1_stroke_m + a]
+    return travel / (1.0 + p[P.axis_1_gain + a]) * k[K.counts_per_unit + a]
 
 
 @kernel
@@ -244,18 +246,18 @@ def _command_one(p, k, prepared, m, out, state, moved, wanted):
             goal = angle + 2.0 * math.pi * turn
             worm = 0.0
             for _ in range(8):
-                worm = p[24 + 2 * a] * math.sin(k[17 + a] * (goal - worm)) + p[25 + 2 * a] * math.cos(
-                    k[17 + a] * (goal - worm)
-                )
+                worm = p[P.worm_1_sin_rad + 2 * a] * math.sin(k[K.worm_ratio + a] * (goal - worm)) + p[
+                    P.worm_1_cos_rad + 2 * a
+                ] * math.cos(k[K.worm_ratio + a] * (goal - worm))
             count = _count_guess(a, goal - worm, p, k, prepared)
-            if k[22 + 2 * a] <= count <= k[23 + 2 * a]:
+            if k[K.lowest_count + a] <= count <= k[K.highest_count + a]:
                 best = count
                 break
             if turn == 0:
                 best = count
         out[a] = best
     for a in range(2):
-        if not (k[22 + 2 * a] <= out[a] <= k[23 + 2 * a]):
+        if not (k[K.lowest_count + a] <= out[a] <= k[K.highest_count + a]):
             return 2
     return 0
 
@@ -267,7 +269,7 @@ def command_batch(p, k, row):
     out = np.full((len(p), n, 2), np.nan)
     status = np.empty((len(p), n), np.int8)
     for h in prange(len(p)):
-        prepared = np.empty(_N_PREPARED)
+        prepared = np.empty(N_PREPARED)
         state = np.empty(6)
         moved = np.empty(6)
         wanted = np.empty(3)

@@ -29,8 +29,9 @@ from rfpose.feedback.calibrated import (
     RowStatus,
     resolve_free,
 )
+from rfpose.feedback.columns import M, columns_of, scales_of
 from rfpose.feedback.measurements import Measurements
-from rfpose.feedback.mount import PARAMETERS, Mount, stack_mounts
+from rfpose.feedback.mount import Mount, stack_mounts
 from rfpose.feedback.prediction import (
     Prediction,
     normal_differences,
@@ -169,7 +170,7 @@ def pad(
     longest = max(1, *(len(m) for m in measurements))
     count = np.zeros((len(mounts), longest, 2))
     row = np.zeros((len(mounts), longest, _kernels.N_ROW))
-    row[..., 8] = 1.0
+    row[..., M.sigma_rad] = 1.0
     use = np.zeros((len(mounts), longest), np.bool_)
     for i, (mount, m) in enumerate(zip(mounts, measurements, strict=True)):
         count[i, : len(m)], row[i, : len(m)] = m.count, m.row
@@ -207,8 +208,8 @@ def solve(
     settings: FitSettings,
 ) -> FieldCalibration:
     """Fit rows of parameters to rows of measurements and say what is known of the result."""
-    index = np.array([list(PARAMETERS).index(name) for name in free])
-    scale = np.array([PARAMETERS[name] for name in free])
+    index = columns_of(free)
+    scale = scales_of(free)
     low, high, mean, weight = _limits(p[:, index], free, settings)
     enough = use.sum(axis=1) >= _least(free, settings)
     masked = use & enough[:, None]
@@ -275,7 +276,7 @@ def _minimise(
     noise, fitted = np.ones(len(start)), start
     for _ in range(_TURNS):
         row = problem.row.copy()
-        row[..., 8] *= noise[:, None]
+        row[..., M.sigma_rad] *= noise[:, None]
         fitted, iterations, _ = kernel(fitted, row, True)
         redundancy = 2.0 * problem.use.sum(axis=1) - problem.carried(fitted, noise)
         noise = noise_with_assumed(problem.scatter(fitted), problem.use, redundancy)

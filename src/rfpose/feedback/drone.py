@@ -22,6 +22,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels
+from rfpose.feedback.columns import constant
 from rfpose.feedback.drive import Drive
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, aim_rows, stack_mounts
@@ -187,7 +188,7 @@ def fly(
         raise InvalidInputError(f"`n_point` must be one or more, got {n_point}")
     target = np.broadcast_to(as_float_array("target_enu_m", target_enu_m, ("...", 3)), (len(mounts), 3))
     p, k = stack_mounts(mounts)
-    pivot = k[:, 19:22]
+    pivot = constant(k, "pivot_enu_m")
     count = np.empty((len(mounts), 0, 2))
     good = np.empty((len(mounts), 0), np.bool_)
     for _ in range(_ROUNDS):
@@ -247,7 +248,7 @@ def _measure(
     """Fly to where the mirrors, standing as their drives leave them, show the target; read GPS and counts."""
     told, real = count, count
     if drives is not None:
-        scale = k[:, None, 13:15]
+        scale = constant(k, "counts_per_unit")[:, None]
         pulse = np.array([drive.pulse_rad for drive in drives])
         slack = np.array([drive.backlash_rad for drive in drives])
         told = np.rint(count / scale / pulse) * pulse * scale

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
+from rfpose.feedback.columns import M
 from rfpose.feedback.mount import aim_rows
 
 __all__ = ["Measurements", "join"]
@@ -42,7 +43,7 @@ class Measurements:
     @property
     def sigma_rad(self) -> FloatArray:
         """Stated standard deviation of each normal, one component [rad]."""
-        return self.row[:, 8]
+        return self.row[:, M.sigma_rad]
 
     def __len__(self) -> int:
         return len(self.count)
@@ -110,7 +111,7 @@ class Measurements:
         normal = geometry.unit(as_float_array("normal_enu", normal_enu, ("measurement", 3), finite=False))
         made = _make(count, normal, normal, (False, False), sigma_rad, unix_s)
         row = made.row.copy()
-        row[:, 9] = receiver_plane
+        row[:, M.of_receiver_plane] = receiver_plane
         return Measurements(count=made.count, row=read_only(row), unix_s=made.unix_s)
 
     @classmethod
@@ -164,7 +165,9 @@ def _make(
 ) -> Measurements:
     counts = as_float_array("count", count, (len(source), 2), finite=False)
     row = aim_rows(source, target, source_is_point=is_point[0], target_is_point=is_point[1])
-    row[:, 8] = as_float_array("sigma_rad", np.broadcast_to(sigma_rad, len(source)), (len(source),), positive=True)
+    row[:, M.sigma_rad] = as_float_array(
+        "sigma_rad", np.broadcast_to(sigma_rad, len(source)), (len(source),), positive=True
+    )
     times = np.arange(len(source), dtype=np.float64) if unix_s is None else unix_s
     return Measurements(
         count=read_only(counts),

@@ -30,6 +30,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels
+from rfpose.feedback.columns import CONSTANTS, PARAMETERS, M
 
 __all__ = [
     "PARAMETERS",
@@ -42,46 +43,6 @@ __all__ = [
     "mount_frame_from_axis",
     "posture",
 ]
-
-PARAMETERS: dict[str, float] = {
-    "pedestal_tilt_north_rad": 1e-3,
-    "pedestal_tilt_east_rad": 1e-3,
-    "pedestal_twist_rad": 1e-3,
-    "axis_1_zero_rad": 1e-3,
-    "axis_2_zero_rad": 1e-3,
-    "nonorthogonality_rad": 1e-3,
-    "canting_up_rad": 1e-3,
-    "canting_right_rad": 1e-3,
-    "location_east_m": 1e-2,
-    "location_north_m": 1e-2,
-    "location_up_m": 1e-2,
-    "pylon_length_m": 1e-1,
-    "arm_normal_m": 1e-2,
-    "arm_up_m": 1e-2,
-    "arm_right_m": 1e-2,
-    "axis_offset_m": 1e-2,
-    "axis_1_gain": 1e-3,
-    "axis_2_gain": 1e-3,
-    "actuator_1_stroke_m": 1e-3,
-    "actuator_2_stroke_m": 1e-3,
-    "actuator_1_radius_m": 1e-3,
-    "actuator_2_radius_m": 1e-3,
-    "actuator_1_offset_m": 1e-3,
-    "actuator_2_offset_m": 1e-3,
-    "worm_1_sin_rad": 1e-3,
-    "worm_1_cos_rad": 1e-3,
-    "worm_2_sin_rad": 1e-3,
-    "worm_2_cos_rad": 1e-3,
-    "gravity_sag_rad": 1e-3,
-    "receiver_plane_up_rad": 1e-3,
-    "receiver_plane_right_rad": 1e-3,
-    "drone_camera_east_m": 1e-3,
-    "drone_camera_north_m": 1e-3,
-    "drone_camera_up_m": 1e-3,
-}
-"""Every parameter of a mount, in the kernels' order, with the size of a usual change (it scales the fit).
-
-The last three belong to the drone that looked at it: its camera less its antenna."""
 
 _NAMES = tuple(PARAMETERS)
 
@@ -208,21 +169,20 @@ class Mount:
         return np.array([self.parameters[name] for name in _NAMES])
 
     def constant_vector(self) -> FloatArray:
-        """Return what a calibration does not change, as the kernels read it."""
-        first, second = self.actuators
-        return np.concatenate(
-            [
-                self.rot_enu_from_mount.ravel(),
-                [float(a.kind == "linear") for a in self.actuators],
-                [a.sign for a in self.actuators],
-                [a.counts_per_unit for a in self.actuators],
-                [a.angle_at_zero_rad for a in self.actuators],
-                [a.worm_ratio for a in self.actuators],
-                self.pivot_enu_m,
-                first.limits_count,
-                second.limits_count,
-            ]
-        )
+        """Return what a calibration does not change, in the order of `CONSTANTS`."""
+        axes = self.actuators
+        values: dict[str, npt.ArrayLike] = {
+            "rot_enu_from_mount": self.rot_enu_from_mount,
+            "is_linear": [a.kind == "linear" for a in axes],
+            "sign": [a.sign for a in axes],
+            "counts_per_unit": [a.counts_per_unit for a in axes],
+            "angle_at_zero_rad": [a.angle_at_zero_rad for a in axes],
+            "worm_ratio": [a.worm_ratio for a in axes],
+            "pivot_enu_m": self.pivot_enu_m,
+            "lowest_count": [a.limits_count[0] for a in axes],
+            "highest_count": [a.limits_count[1] for a in axes],
+        }
+        return np.concatenate([np.ravel(np.asarray(values[name], np.float64)) for name in CONSTANTS])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -320,9 +280,9 @@ def aim_rows(
     """Rows of sources and targets as the kernels read them."""
     source, target = np.broadcast_arrays(source_enu, target_enu)
     rows = np.zeros((*source.shape[:-1], _kernels.N_ROW))
-    rows[..., 0:3], rows[..., 3] = source, source_is_point
-    rows[..., 4:7], rows[..., 7] = target, target_is_point
-    rows[..., 8] = 1.0
+    rows[..., M.source_enu : M.source_enu + 3], rows[..., M.source_is_point] = source, source_is_point
+    rows[..., M.target_enu : M.target_enu + 3], rows[..., M.target_is_point] = target, target_is_point
+    rows[..., M.sigma_rad] = 1.0
     return rows
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibrated import Known
+from rfpose.feedback.columns import M, columns_of, scales_of
 from rfpose.feedback.measurements import Measurements
-from rfpose.feedback.mount import PARAMETERS, Mount, stack_mounts
+from rfpose.feedback.mount import Mount, stack_mounts
 
 __all__ = ["Prediction", "normal_differences", "normal_errors_rad", "posture_jacobian", "predict"]
 
@@ -90,10 +91,10 @@ def predict(calibration: Known, postures: Measurements) -> Prediction:
 def posture_jacobian(mount: Mount, postures: Measurements, free: tuple[str, ...]) -> FloatArray:
     """Return the derivative of modelled minus wanted normals by parameters (posture, xyz, free)."""
     row = postures.row.copy()
-    row[:, 8] = 1.0
+    row[:, M.sigma_rad] = 1.0
     p, k = stack_mounts([mount])
-    index = np.array([list(PARAMETERS).index(name) for name in free], np.int64)
-    scale = np.array([PARAMETERS[name] for name in free], np.float64)
+    index = columns_of(free)
+    scale = scales_of(free)
     use = np.ones((1, len(postures)), np.bool_)
     count = postures.count.copy()
     jacobian: FloatArray = _kernels.jacobian_batch(p, k, count[None], row[None], use, index, scale)[0]

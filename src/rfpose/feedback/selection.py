@@ -20,8 +20,9 @@ from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibrated import PARAMETER_SETS, Calibration, Choice, FieldCalibration, FitSettings
 from rfpose.feedback.calibration import fit, row_status, solve
+from rfpose.feedback.columns import columns_of
 from rfpose.feedback.measurements import Measurements
-from rfpose.feedback.mount import PARAMETERS, Mount, stack_mounts
+from rfpose.feedback.mount import Mount, stack_mounts
 from rfpose.feedback.uncertainty import RAYLEIGH_MEDIAN
 
 __all__ = [
@@ -237,7 +238,7 @@ def refit(
     count = np.repeat(measurements.count[None], n, axis=0)
     row = np.repeat(measurements.row[None], n, axis=0)
     found = solve(p, k, count, row, masks, free, settings)
-    p[:, [list(PARAMETERS).index(name) for name in free]] = found.working
+    p[:, columns_of(free)] = found.working
     residual = _kernels.residuals_batch(p, k, count, row, np.ones_like(masks))
     chord = np.linalg.norm(residual, axis=-1) * measurements.sigma_rad
     return 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)), found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -51,6 +52,11 @@ class Drive(Record):
     elevation_limits_deg: tuple[float, float] = (-5.0, 95.0)
     azimuth_limits_deg: tuple[float, float] = (-540.0, 540.0)
     """From the middle of each mirror's travel on the first day."""
+
+    @property
+    def step_rad(self) -> float:
+        """Of the axis, for the steps that a motor takes together."""
+        return 2.0 * math.pi / self.steps_per_turn * self.microsteps
 
 
 class Wind(Record):
@@ -173,6 +179,11 @@ class Encoder(Record):
     bits: Annotated[int, Field(ge=8, le=26)] = 16
     gain_per_s: NonNegative = 0.5
 
+    @property
+    def level_rad(self) -> float:
+        """Width of a level."""
+        return 2.0 * math.pi / 2.0**self.bits
+
 
 class SunSensor(Record):
     """Shadow-bar sensor on a dish (Edwards, App. F)."""
@@ -186,6 +197,11 @@ class SunSensor(Record):
     """Over a day."""
     gain_per_s: NonNegative = 0.2
     integral_gain_per_s2: NonNegative = 0.01
+
+    @property
+    def level_rad(self) -> float:
+        """Width of a level."""
+        return 2e-3 * self.range_mrad / self.levels
 
 
 class RadioModel(Record):

@@ -153,7 +153,7 @@ def test_without_the_centre_clusters_go_on_then_stow():
     rig = Rig(mode=Mode.TRACK)
     rig.run(5)
     rig.control.fail_centre()
-    rig.run(29, wind_m_s=20.0)
+    rig.run(29, wind_mps=20.0)
     assert rig.modes() == {"TRACK"}
     assert np.all(rig.orders.sun_age_s < 5.0)
     assert "the centre is dead since 4.5 s" in rig.control.command(Event.DEFOCUS).reasons[0]
@@ -165,35 +165,35 @@ def test_without_the_centre_clusters_go_on_then_stow():
     assert rig.modes() == {"STOW"}
     rig.control.repair_centre()
     assert rig.control.alarms == ()
-    rig.run(1, wind_m_s=20.0)
+    rig.run(1, wind_mps=20.0)
     assert rig.control.alarms == ("strong wind",)
 
 
 def test_wind_of_ten_metres_a_second_stows_and_calm_releases():
     rig = Rig(mode=Mode.TRACK, settings=FieldSettings(wind_release_s=30.0))
-    rig.run(5, wind_m_s=9.99)
+    rig.run(5, wind_mps=9.99)
     assert rig.control.alarms == ()
-    rig.run(2, wind_m_s=10.0)
+    rig.run(2, wind_mps=10.0)
     assert rig.control.alarms == ("strong wind",)
     assert rig.modes() == {"STOWING"}
-    rig.run(60, wind_m_s=8.5)
+    rig.run(60, wind_mps=8.5)
     assert rig.modes() == {"STOW"}
     assert "strong wind" in rig.control.command(Event.APPROACH).reasons[0]
-    rig.run(29, wind_m_s=7.0)
+    rig.run(29, wind_mps=7.0)
     assert rig.control.alarms == ("strong wind",)
-    rig.run(3, wind_m_s=7.0)
+    rig.run(3, wind_mps=7.0)
     assert rig.control.alarms == ()
     assert rig.modes() == {"STOW"}
 
 
 def test_unknown_wind_stows_after_a_gap():
     rig = Rig(mode=Mode.TRACK)
-    rig.run(60, wind_m_s=np.nan)
+    rig.run(60, wind_mps=np.nan)
     assert rig.modes() == {"TRACK"}
-    rig.run(2, wind_m_s=np.nan)
+    rig.run(2, wind_mps=np.nan)
     assert rig.control.alarms == ("wind unknown",)
     assert rig.modes() == {"STOWING"}
-    rig.run(1, wind_m_s=2.0)
+    rig.run(1, wind_mps=2.0)
     assert rig.control.alarms == ()
 
 
@@ -472,7 +472,7 @@ def test_a_field_put_away_and_taken_up_goes_on_the_same():
         rig.run(20)
         rig.control.fail_cluster(1)
         rig.control.command(Event.DEFOCUS, np.arange(0, 100, 7))
-        rig.run(7, wind_m_s=11.0)
+        rig.run(7, wind_mps=11.0)
 
     first_half(whole)
     first_half(begun)
@@ -500,7 +500,7 @@ def _step(control, **changes):
     ("call", "says"),
     [
         (lambda c: _step(c, time_s=-1.0), "`time_s` must not go back, got -1"),
-        (lambda c: _step(c, wind_m_s=-3.0), "`wind_m_s` must not be negative"),
+        (lambda c: _step(c, wind_mps=-3.0), "`wind_mps` must not be negative"),
         (lambda c: _step(c, axis_rad=np.zeros((3, 2))), r"`axis_rad` must have shape \(40, 2\)"),
         (lambda c: _step(c, sun_enu=[np.nan, 0, 1]), "`sun_enu` must be finite"),
         (lambda c: c.command(Event.ARRIVED), "`command` must be one of"),
@@ -535,7 +535,7 @@ def test_wrong_fields_say_what_is_wrong(change, says):
     [
         {"emergency_hold_s": -1.0},
         {"watchdog_intervals": 0.0},
-        {"wind_release_m_s": 12.0},
+        {"wind_release_mps": 12.0},
         {"stow_axis_rad": (0.0, 0.0, 0.0)},
     ],
 )

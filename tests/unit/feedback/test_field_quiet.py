@@ -96,7 +96,7 @@ class Twin:
             axis_rad=self.axis,
             aim_axis_rad=world.aim_axis,
             sun_enu=world.sun[second],
-            wind_m_s=float(world.wind[second]),
+            wind_mps=float(world.wind[second]),
             feedback_valid=world.feedback[second],
             found=world.found[second],
         )
@@ -194,13 +194,13 @@ def test_wind_may_vary_below_the_limit():
     wind[100] = 10.0
     n_jump, now = 0, 0
     for control in (fine, rare):
-        control.step(0.0, **inputs, wind_m_s=wind[0])
+        control.step(0.0, **inputs, wind_mps=wind[0])
     while now < 120:
         then = max(int(rare.quiet_until(now // 4 * 4 + 4)), now + 1)
         n_jump += then > now + 1
         for second in range(now + 1, then + 1):
-            fine.step(second, **inputs, wind_m_s=wind[second])
-        rare.step(then, **inputs, wind_m_s=wind[then])
+            fine.step(second, **inputs, wind_mps=wind[second])
+        rare.step(then, **inputs, wind_mps=wind[then])
         now = then
         one, other = fine.state(), rare.state()
         for name in one.keys() - {"centre"}:
@@ -245,20 +245,20 @@ def test_ends_of_the_centres_clocks_are_stepped_to():
         return control.quiet_until(now + 4.0)
 
     for now in (0.0, 1.0):
-        until(now, wind_m_s=10.0)
+        until(now, wind_mps=10.0)
     assert control.alarms == ("strong wind",)
-    until(4.0, wind_m_s=10.0)  # stow is ordered
-    until(8.0, wind_m_s=10.0)
-    assert [until(now, wind_m_s=7.0) - now for now in (28.0, 32.0, 36.0)] == [4.0, 4.0, 0.0]
-    assert until(38.0, wind_m_s=7.0) == 40.0  # the next round
+    until(4.0, wind_mps=10.0)  # stow is ordered
+    until(8.0, wind_mps=10.0)
+    assert [until(now, wind_mps=7.0) - now for now in (28.0, 32.0, 36.0)] == [4.0, 4.0, 0.0]
+    assert until(38.0, wind_mps=7.0) == 40.0  # the next round
     assert control.alarms == ()
-    assert [until(now, wind_m_s=np.nan) - now for now in (52.0, 56.0)] == [4.0, 0.0]
+    assert [until(now, wind_mps=np.nan) - now for now in (52.0, 56.0)] == [4.0, 0.0]
     control.step(56.0, **inputs)
     control.fail_centre()
-    assert [until(now, wind_m_s=20.0) - now for now in (60.0, 64.0)] == [4.0, 0.0]
+    assert [until(now, wind_mps=20.0) - now for now in (60.0, 64.0)] == [4.0, 0.0]
     control.repair_centre()
     assert control.quiet_until(65.0) == 64.0  # the first look at the wind is to come
-    until(64.0, wind_m_s=20.0)
+    until(64.0, wind_mps=20.0)
     assert control.alarms == ("strong wind",)
 
 

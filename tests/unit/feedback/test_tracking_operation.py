@@ -8,6 +8,7 @@ import pytest
 
 from rfpose.cli.track import _event
 from rfpose.errors import ScenarioError
+from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import Simulation, _kernels
 from rfpose.feedback.tracking.operation import Operation, _agenda, _Wind, settings_of, who_of
@@ -105,10 +106,10 @@ def test_mirrors_are_parked_where_they_are_to_be_within_the_time_for_ways(stow):
     simulation = Simulation(site, methods=("open-loop",), count=8)
     field, day = simulation.field, simulation.days[0]
     assert day.from_stow
-    operation = Operation(site, field, simulation.gusts, day, i_day=0, feedback=_kernels.NO_FEEDBACK, seed=1)
+    operation = Operation(simulation.plant, 0, feedback=_kernels.NO_FEEDBACK)
     state = np.zeros((8, _kernels.N_STATE))
     operation.park(state)
-    per_rad, home = field.constant[:, 13:15], field.constant[:, 15:17]
+    per_rad, home = (constant(field.constant, name) for name in ("counts_per_unit", "angle_at_zero_rad"))
     axis = home + state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / per_rad
     off = np.mod(axis - np.deg2rad(stow) + np.pi, 2.0 * np.pi) - np.pi
     assert np.max(np.abs(off)) <= np.pi / 48_000.0 * (1.0 + 1e-9)
@@ -165,7 +166,7 @@ def test_settings_go_through_to_field_control():
         4.0,
         25,
     )
-    assert (found.wind_stow_m_s, found.wind_release_m_s, found.wind_release_s) == (12.0, 6.0, 99.0)
+    assert (found.wind_stow_mps, found.wind_release_mps, found.wind_release_s) == (12.0, 6.0, 99.0)
 
 
 # ---- wind ---------------------------------------------------------------------------------------------------------

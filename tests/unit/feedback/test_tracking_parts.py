@@ -19,6 +19,7 @@ from rfpose.feedback.tracking.hidden import draw_field, field_positions
 from rfpose.feedback.tracking.loops import _swing, check_gains, loop_margins
 from rfpose.feedback.tracking.methods import choose
 from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.sampled_loop import SampledLoop
 from rfpose.feedback.tracking.score import quantile
 from rfpose.feedback.tracking.timeline import days, site_of
 from rfpose.feedback.tracking.wind import Gusts
@@ -66,17 +67,19 @@ def oscillates(gain, integral, interval, latency):
 @pytest.mark.parametrize(("gain", "integral"), [(0.06, 0.0), (0.06, 0.0004), (0.1, 0.002)])
 @pytest.mark.parametrize(("interval", "latency"), [(1.0, 1.0), (4.0, 1.0), (4.0, 9.0)])
 def test_gain_margin_is_where_the_loop_begins_to_grow(gain, integral, interval, latency):
-    margin = loop_margins(gain, integral, interval_s=interval, latency_s=latency).gain
+    margin = loop_margins(
+        SampledLoop(gain_per_s=gain, integral_gain_per_s2=integral, interval_s=interval, latency_s=latency)
+    ).gain
     assert not oscillates(0.97 * margin * gain, 0.97 * margin * integral, interval, latency)
     assert oscillates(1.03 * margin * gain, 1.03 * margin * integral, interval, latency)
 
 
 def test_margins_of_a_pure_integrator():
     # L = K T / (z − 1): grows from K T = 2 on; unity gain at |z − 1| = K T
-    margins = loop_margins(0.05, 0.0, interval_s=4.0, latency_s=0.0)
+    margins = loop_margins(SampledLoop(gain_per_s=0.05, interval_s=4.0, latency_s=0.0))
     assert margins.gain == pytest.approx(10.0, rel=1e-3)
     assert margins.unity_hz == pytest.approx(2.0 * np.arcsin(0.1) / (2.0 * np.pi * 4.0), rel=1e-3)
-    assert loop_margins(0.05, 0.0, interval_s=4.0, latency_s=9.0).gain < margins.gain
+    assert loop_margins(SampledLoop(gain_per_s=0.05, interval_s=4.0, latency_s=9.0)).gain < margins.gain
 
 
 def test_gains_without_margin_are_refused_unless_forced():

@@ -4,7 +4,7 @@
 
     control = FieldControl(aim_enu_m=aim, pivot_enu_m=pivot, mode=Mode.TRACK, rng=rng)
     control.command(Event.DEFOCUS, [3, 7])               # any time; answers who is refused, and why
-    orders = control.step(t, axis_rad=axis, aim_axis_rad=aim_axis, sun_enu=sun, wind_m_s=wind, feedback_valid=ok)
+    orders = control.step(t, axis_rad=axis, aim_axis_rad=aim_axis, sun_enu=sun, wind_mps=wind, feedback_valid=ok)
 
 ``orders.mode`` is the `modes.Mode` of each heliostat. ``orders.target_axis_rad`` says where its axes shall go at full
 speed; it is NaN where the heliostat follows ``orders.aim_enu_m`` and the caller's controller steers, by

@@ -268,7 +268,7 @@ class FieldControl:
         axis_rad: npt.ArrayLike,
         aim_axis_rad: npt.ArrayLike,
         sun_enu: npt.ArrayLike,
-        wind_m_s: float = 0.0,
+        wind_mps: float = 0.0,
         feedback_valid: npt.ArrayLike = True,
         found: npt.ArrayLike = False,
     ) -> Orders:
@@ -285,7 +285,7 @@ class FieldControl:
             NaN: cannot be reached.
         sun_enu : (xyz)
             Direction towards the sun.
-        wind_m_s
+        wind_mps
             Wind at the field [m/s]; NaN: unknown.
         feedback_valid : (heliostat,) or one
             Whether normals are measured now; where not, track becomes point and back.
@@ -300,8 +300,8 @@ class FieldControl:
         n = self.n_heliostat
         if not time_s >= self._time_s:
             raise InvalidInputError(f"`time_s` must not go back, got {time_s} after {self._time_s}")
-        if wind_m_s < 0.0:
-            raise InvalidInputError(f"`wind_m_s` must not be negative, got {wind_m_s}")
+        if wind_mps < 0.0:
+            raise InvalidInputError(f"`wind_mps` must not be negative, got {wind_mps}")
         axis = as_float_array("axis_rad", axis_rad, (n, 2), finite=False)
         aim_axis = as_float_array("aim_axis_rad", aim_axis_rad, (n, 2), finite=False)
         sun = as_float_array("sun_enu", sun_enu, (3,))
@@ -310,7 +310,7 @@ class FieldControl:
         self._time_s = float(time_s)
         self._heliostats.count_steps(axis)
         if self._centre_lost_s is None:
-            self._watch_wind(wind_m_s)
+            self._watch_wind(wind_mps)
             self._watch_sun(sun)
         elif self._time_s - self._centre_lost_s >= self.settings.centre_silence_s:
             self._raise_alarm(_CENTRE_SILENT, Event.EMERGENCY)
@@ -330,8 +330,8 @@ class FieldControl:
         steers by a sun that is one round older. This holds while, up to that time,
 
         - wind and feedback stay as given in the last step; feedback may change in the step there itself. Known wind may
-          vary below ``wind_stow_m_s`` while there is no wind alarm: only the time in the state when it was last above
-          ``wind_release_m_s`` differs then, which the next strong wind sets anew;
+          vary below ``wind_stow_mps`` while there is no wind alarm: only the time in the state when it was last above
+          ``wind_release_mps`` differs then, which the next strong wind sets anew;
         - the sun moves no faster than the sky turns;
         - nobody calls `command`, `emergency`, `fail_cluster` or another method that changes something.
 
@@ -484,16 +484,16 @@ class FieldControl:
             to = np.array(weaker)[self._wire.pending + 1]
             self._wire.send(command, to, self._time_s, urgent=True, from_centre=self._centre_lost_s is None)
 
-    def _watch_wind(self, wind_m_s: float) -> None:
+    def _watch_wind(self, wind_mps: float) -> None:
         now, settings = self._time_s, self.settings
-        if math.isfinite(wind_m_s):
+        if math.isfinite(wind_mps):
             self._wind_known_s = now
             self._alarms.pop(_WIND_UNKNOWN, None)
         elif now - self._wind_known_s >= settings.wind_gap_s:
             self._raise_alarm(_WIND_UNKNOWN, Event.STOW)
-        if not wind_m_s < settings.wind_release_m_s:
+        if not wind_mps < settings.wind_release_mps:
             self._wind_calm_s = now
-        if wind_m_s >= settings.wind_stow_m_s:
+        if wind_mps >= settings.wind_stow_mps:
             self._raise_alarm(_WIND, Event.STOW)
         elif now - self._wind_calm_s >= settings.wind_release_s:
             self._alarms.pop(_WIND, None)

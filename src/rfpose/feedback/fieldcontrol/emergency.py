@@ -17,6 +17,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels, optics
+from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S, move_axes
@@ -172,7 +173,7 @@ class _Mirrors:
         n = len(pivot_enu_m)
         self._parameters = np.repeat(parameters, n, axis=0)
         self._constants = np.repeat(constants, n, axis=0)
-        self._constants[:, 19:22] = pivot_enu_m
+        constant(self._constants, "pivot_enu_m")[:] = pivot_enu_m
 
     def axes_for(self, sun_enu: FloatArray, aim_enu_m: FloatArray) -> FloatArray:
         """Return axis angles that send the sun to aim points [rad]; NaN where there are none."""
@@ -193,7 +194,7 @@ def play(
     *,
     time_s: npt.ArrayLike,
     sun_enu: npt.ArrayLike,
-    wind_m_s: npt.ArrayLike = 0.0,
+    wind_mps: npt.ArrayLike = 0.0,
     happenings: Mapping[float, Callable[[FieldControl], object]] | None = None,
 ) -> Play:
     """Return what a field does: steps its control, moves its axes, adds up its flux.
@@ -208,7 +209,7 @@ def play(
         Ascending times [s].
     sun_enu : (time, xyz) or (xyz)
         Direction towards the sun.
-    wind_m_s : (time,) or one
+    wind_mps : (time,) or one
         Wind [m/s]; NaN: unknown.
     happenings
         What is done to the control at the first of the times that is not before a given one, after that step.
@@ -220,7 +221,7 @@ def play(
     """
     times = as_float_array("time_s", time_s, ("time",))
     sun = geometry.unit(np.broadcast_to(as_float_array("sun_enu", sun_enu, ("...", 3)), (len(times), 3)))
-    wind = np.broadcast_to(as_float_array("wind_m_s", wind_m_s, ("...",), finite=False), times.shape)
+    wind = np.broadcast_to(as_float_array("wind_mps", wind_mps, ("...",), finite=False), times.shape)
     n = control.n_heliostat
     if len(field.pivot_enu_m) != n:
         raise InvalidInputError(f"`field` must have the {n} heliostats of `control`, got {len(field.pivot_enu_m)}")
@@ -236,7 +237,7 @@ def play(
     tally = _Tally(len(times), n, full)
     aimed_s = times[0]
     for i, now in enumerate(times):
-        orders = control.step(now, axis_rad=axis, aim_axis_rad=aim_axis, sun_enu=sun[i], wind_m_s=float(wind[i]))
+        orders = control.step(now, axis_rad=axis, aim_axis_rad=aim_axis, sun_enu=sun[i], wind_mps=float(wind[i]))
         steering = np.isin(orders.mode, _EVERYTHING_STANDS, invert=True).any()
         if orders.changed.any() or (steering and now - aimed_s >= _AIM_EVERY_S):
             aim = np.where(np.isnan(orders.aim_enu_m), receiver_enu_m, orders.aim_enu_m)

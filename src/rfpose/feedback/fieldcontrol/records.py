@@ -47,9 +47,9 @@ class FieldSettings:
         Time at each cell [s].
     search_cells
         Cells after which the search gives up.
-    wind_stow_m_s
+    wind_stow_mps
         Wind at which the field is stowed [m/s].
-    wind_release_m_s, wind_release_s
+    wind_release_mps, wind_release_s
         The wind alarm ends when the wind stayed below this for so long.
     wind_gap_s
         Unknown wind for so long counts as strong [s].
@@ -77,8 +77,8 @@ class FieldSettings:
     search_step_m: float = 1.0
     search_dwell_s: float = 5.0
     search_cells: int = 81
-    wind_stow_m_s: float = 10.0
-    wind_release_m_s: float = 8.0
+    wind_stow_mps: float = 10.0
+    wind_release_mps: float = 8.0
     wind_release_s: float = 600.0
     wind_gap_s: float = 60.0
     sun_lowest_rad: float = 0.0
@@ -94,10 +94,10 @@ class FieldSettings:
                     raise InvalidInputError(f"`{name}` must not be negative, got {value}")
             elif name != "sun_lowest_rad":
                 as_positive(name, value)
-        if self.wind_release_m_s > self.wind_stow_m_s:
+        if self.wind_release_mps > self.wind_stow_mps:
             raise InvalidInputError(
-                f"`wind_release_m_s` must not exceed `wind_stow_m_s`, got {self.wind_release_m_s} and "
-                f"{self.wind_stow_m_s} m/s"
+                f"`wind_release_mps` must not exceed `wind_stow_mps`, got {self.wind_release_mps} and "
+                f"{self.wind_stow_mps} m/s"
             )
 
 

@@ -1,7 +1,7 @@
 """Kernels of the tracking loop: one mirror after the other, each through all steps of a stretch of time.
 
-The mount's parameters ``p`` (31) and constants ``k`` (26) are those of `rfpose.feedback._kernels`. Step g of a day is
-its g-th servo interval. Everything random is drawn outside and handed in.
+The mount's parameters ``p`` and constants ``k`` are those of `rfpose.feedback._kernels`. Step g of a day is its g-th
+servo interval, step s of a stretch is step ``step0 + s`` of the day. Everything random is drawn outside and handed in.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from rfpose.feedback._kernels import _axis, _bisector, _command_one, _posture, _prepare
-from rfpose.feedback.servo._kernels import law_step, stepper_step
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.checks import FloatArray
+from rfpose.feedback._kernels import N_PREPARED, N_ROW, _axis, _bisector, _command_one, _posture, _prepare
+from rfpose.feedback.columns import K, M, P
+from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers, law_step, stepper_step
+from rfpose.jit import kernel
 
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
@@ -30,12 +33,6 @@ N_STATE = 35
 N_RING, N_ENTRY = 16, 6
 LOST, USED, HEARD = 0.0, 1.0, 2.0
 """Heard: received while the mirror was about something else; neither steered by nor learnt from."""
-
-N_SCRATCH = 112
-N_BLOCK = 64
-"""Mirrors are shared out in so many parts, each with room of its own to work in."""
-FEW = 48
-"""Up to so many mirrors one core is quicker than sharing them out, since field control has a word each second."""
 
 # what is added up over a day
 (
@@ -100,6 +97,192 @@ class Loop(NamedTuple):
     swing_right: float
     swing_up: float
     """Its standard deviation [rad]."""
+
+
+class Steering(NamedTuple):
+    """How a method steers: its law turns errors into speeds, drives are in counts and servo steps."""
+
+    loop: Loop
+    law: LawNumbers
+    drive_1: DriveNumbers
+    drive_2: DriveNumbers
+    table: FloatArray
+    """What is caught, by the error of the normal; see `rfpose.feedback.tracking.capture`."""
+
+
+class Tasks(NamedTuple):
+    """What each mirror is to do from now on."""
+
+    duty: npt.NDArray[np.int64]
+    """GO, FOLLOW or TRACK."""
+    renew: npt.NDArray[np.uint8]
+    """Whether duty or aim is another than before."""
+    scored: npt.NDArray[np.uint8]
+    """Whether on the receiver."""
+    mode: npt.NDArray[np.int64]
+    """Row of `Tally.by_mode`."""
+    aim: FloatArray
+    """(mirror, xyz) [m]"""
+    goal: FloatArray
+    """(mirror, axis) counts, for GO."""
+    heard: FloatArray
+    """(mirror, interval, xyz) sun by the last message,"""
+    age: FloatArray
+    """(mirror, interval) so many steps before the first one; NaN: the sun is known."""
+
+
+class Mounts(NamedTuple):
+    """Mirrors as they stand."""
+
+    true: FloatArray
+    """(mirror, parameter)"""
+    constant: FloatArray
+    """(mirror, constant)"""
+    lean: FloatArray
+    """(mirror, 2) of the pedestal by day, times the heat [rad]."""
+    target: FloatArray
+    """(mirror, 4) receiver [m], and 1 for a dish."""
+
+
+class Models(NamedTuple):
+    """What the controller believes of the mounts; changed in place."""
+
+    parameters: FloatArray
+    """(mirror, parameter)"""
+    cov: FloatArray
+    """(mirror, free, free) of the rolling fit."""
+    free: npt.NDArray[np.int64]
+    """Columns that it corrects,"""
+    scale: FloatArray
+    """their usual changes,"""
+    walk: FloatArray
+    """and how their variances grow from fit to fit."""
+
+
+class Surroundings(NamedTuple):
+    """Sun, warmth and wind of a stretch of steps."""
+
+    sun: FloatArray
+    """(step + interval + 1, xyz)"""
+    power: FloatArray
+    """(step,) [W/m²], negative outside the field's hours."""
+    heat: FloatArray
+    """(step,)"""
+    hour_of: npt.NDArray[np.int64]
+    """(step,) hour of the day."""
+    mean_speed: float
+    """Of the wind [m/s]."""
+    bend: FloatArray
+    """(2) right, up [rad/(m/s)²]."""
+    gust: npt.NDArray[np.float32]
+    """(mirror, step) [m/s]."""
+    swing: npt.NDArray[np.float32]
+    """(mirror, step, 4) of variance one."""
+
+
+class Readings(NamedTuple):
+    """What comes between mirrors and what is measured of them."""
+
+    noise: npt.NDArray[np.float32]
+    """(mirror, frame, 2) of variance one."""
+    spread: FloatArray
+    """(mirror, 3) its lower triangle, right and up [rad]."""
+    bias: FloatArray
+    """(mirror, 2) right, up [rad]."""
+    lost: npt.NDArray[np.uint8]
+    """(mirror, frame)"""
+    outage: npt.NDArray[np.uint8]
+    """(mirror, step) 0, or which one is on, from 1."""
+    drift: FloatArray
+    """(mirror,) of the receivers' plane or the sensor by day, times the heat [rad]."""
+    null: FloatArray
+    """(mirror, 2) of the sun sensor [rad]."""
+
+
+class Memory(NamedTuple):
+    """What mirrors take from step to step; changed in place."""
+
+    state: FloatArray
+    """(mirror, N_STATE)"""
+    ring: FloatArray
+    """(mirror, N_RING, N_ENTRY) measurements on their way."""
+    light: FloatArray
+    """(mirror, 2) caught and offered at the last step, as parts of the beam."""
+
+
+class Tally(NamedTuple):
+    """What mirrors add up to, in place."""
+
+    total: FloatArray
+    """(mirror, N_SUM)"""
+    by_mode: FloatArray
+    """(mirror, mode, 3)"""
+    by_outage: FloatArray
+    """(mirror, outage, 4)"""
+    hours: FloatArray
+    """(mirror, 24, 2) steps and squared errors."""
+    histogram: npt.NDArray[np.int64]
+    """(mirror, N_BIN) of errors."""
+
+
+class Courses(NamedTuple):
+    """What is kept each ``stride`` steps, written in place."""
+
+    stride: int
+    error: FloatArray
+    """(mirror, kept) [rad]"""
+    light: FloatArray
+    """(mirror, kept, 2)"""
+    stored: npt.NDArray[np.int64]
+    """(mirror,) row of ``trace``, or −1."""
+    trace: FloatArray
+    """(stored, kept, 8) true normal, motor counts, shift."""
+
+
+class Stretch(NamedTuple):
+    """All that mirrors go through a stretch of steps with, but what they are told."""
+
+    step0: int
+    """Of the day."""
+    steering: Steering
+    mounts: Mounts
+    models: Models
+    surroundings: Surroundings
+    readings: Readings
+    memory: Memory
+    tally: Tally
+    courses: Courses
+
+
+class Workspace(NamedTuple):
+    """Where one mirror after the other is worked on."""
+
+    p: FloatArray
+    prepared: FloatArray
+    known: FloatArray
+    guess: FloatArray
+    true: FloatArray
+    wanted: FloatArray
+    hoped: FloatArray
+    error: FloatArray
+    change: FloatArray
+    seen: FloatArray
+    across: FloatArray
+    counts: FloatArray
+    row: FloatArray
+    receiver: FloatArray
+    aside: FloatArray
+    work: FloatArray
+
+
+@kernel
+def _workspace():
+    """Make room to work in."""
+    return Workspace(
+        np.empty(len(P)), np.empty(N_PREPARED), np.empty(N_PREPARED), np.empty(6), np.empty(6), np.empty(3),
+        np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty(2), np.empty(N_ROW), np.empty(N_ROW),
+        np.empty(N_ROW), np.empty((3, 6)),
+    )  # fmt: skip
 
 
 @kernel
@@ -215,11 +398,12 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
 
 
 @kernel
-def _command(p, k, prepared, row, sun, out, work):
-    """Counts that send this sun to the row's target; True where the mirror can reach them."""
-    row[0], row[1], row[2] = sun[0], sun[1], sun[2]
-    if row[9] > 0.5:  # a dish looks where its light comes from
-        row[4], row[5], row[6] = sun[0], sun[1], sun[2]
+def _command(p, k, prepared, row, is_dish, sun, out, work):
+    """Counts that send this sun to the row's target, or a dish to the sun; True where the mirror can reach them."""
+    for i in range(3):
+        row[M.source_enu + i] = sun[i]
+        if is_dish:
+            row[M.target_enu + i] = sun[i]
     out[0] = np.nan
     out[1] = np.nan
     return _command_one(p, k, prepared, row, out, work[0], work[1], work[2][:3]) == 0
@@ -228,9 +412,9 @@ def _command(p, k, prepared, row, sun, out, work):
 @kernel
 def _nearest_turn(near, k, counts):
     """Take axis 1 the whole turns on that bring it nearest to where it is, if its limits allow."""
-    turn = 2.0 * math.pi * k[13]
+    turn = 2.0 * math.pi * k[K.counts_per_unit]
     moved = counts[0] + turn * math.floor((near - counts[0]) / turn + 0.5)
-    if k[22] <= moved <= k[23]:
+    if k[K.lowest_count] <= moved <= k[K.highest_count]:
         counts[0] = moved
 
 
@@ -239,7 +423,7 @@ def _shifted(p, k, prepared, shift, counts, guess, row, work):
     """Move counts so that the model's normal is turned by a small vector; True where the mirror can reach that."""
     _posture(_axis(0, counts[0], p, k, prepared), _axis(1, counts[1], p, k, prepared), p, prepared, 0.0, guess)
     for i in range(3):
-        row[i] = row[4 + i] = guess[i] + shift[i]
+        row[M.source_enu + i] = row[M.target_enu + i] = guess[i] + shift[i]
     return _command_one(p, k, prepared, row, counts, work[0], work[1], work[2][:3]) == 0
 
 
@@ -272,39 +456,53 @@ def _bend(n, right, up):
 
 
 @kernel
-def _track(
-    loop, law, drive_1, drive_2, table,
-    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
-    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
-    stride, trace_error, trace_light, trace, keeps, light, scratch,
-):  # fmt: skip
-    """One mirror through a stretch of steps; see `advance`."""
-    prepared, known, guess, true = scratch[0:16], scratch[16:32], scratch[32:38], scratch[38:44]
-    wanted, hoped, error, change = scratch[44:47], scratch[47:50], scratch[50:53], scratch[53:56]
-    seen, across, counts = scratch[56:59], scratch[59:61], scratch[61:63]
-    row, receiver, aside = scratch[64:74], scratch[74:84], scratch[84:94]
-    work = scratch[94:112].reshape(3, 6)
-    row[:] = 0.0
-    aside[:] = 0.0
+def _track(h, first, end, tasks, stretch, room):
+    """One mirror through steps ``first`` to before ``end`` of a stretch."""
+    loop, law, drive_1, drive_2, table = stretch.steering
+    duty, renew, scored, mode = tasks.duty[h], tasks.renew[h] > 0, tasks.scored[h] > 0, tasks.mode[h]
+    goal, heard, age = tasks.goal[h], tasks.heard[h], tasks.age[h]
+    built, k, lean, target = (
+        stretch.mounts.true[h], stretch.mounts.constant[h], stretch.mounts.lean[h], stretch.mounts.target[h]
+    )  # fmt: skip
+    model, cov = stretch.models.parameters[h], stretch.models.cov[h]
+    free, scale, walk = stretch.models.free, stretch.models.scale, stretch.models.walk
+    sun, power, heat, hour_of, mean_speed, bend = (
+        stretch.surroundings.sun, stretch.surroundings.power, stretch.surroundings.heat, stretch.surroundings.hour_of,
+        stretch.surroundings.mean_speed, stretch.surroundings.bend,
+    )  # fmt: skip
+    gust, swing = stretch.surroundings.gust[h], stretch.surroundings.swing[h]
+    noise, spread, bias = stretch.readings.noise[h], stretch.readings.spread[h], stretch.readings.bias[h]
+    lost, outage, drift = stretch.readings.lost[h], stretch.readings.outage[h], stretch.readings.drift[h]
+    null = stretch.readings.null[h]
+    state, ring, light = stretch.memory.state[h], stretch.memory.ring[h], stretch.memory.light[h]
+    total, by_mode, by_outage = stretch.tally.total[h], stretch.tally.by_mode[h], stretch.tally.by_outage[h]
+    hours, histogram = stretch.tally.hours[h], stretch.tally.histogram[h]
+    stride, trace_error, trace_light = stretch.courses.stride, stretch.courses.error[h], stretch.courses.light[h]
+    keeps = stretch.courses.stored[h] >= 0
+    trace = stretch.courses.trace[max(stretch.courses.stored[h], 0)]
+    step0 = stretch.step0
+    p, prepared, known, guess, true, wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = (
+        room
+    )
     is_dish = target[3] > 0.5
-    row[4:7] = aim
-    row[7] = 0.0 if is_dish else 1.0
-    row[8] = 1.0
-    row[9] = target[3]
+    p[:] = built
+    row[:] = 0.0
+    row[M.target_enu : M.target_enu + 3] = tasks.aim[h]
+    row[M.target_is_point] = 0.0 if is_dish else 1.0
+    row[M.sigma_rad] = 1.0
     receiver[:] = row
-    receiver[4:7] = target[:3]
-    aside[8] = 1.0  # a row whose light comes from and goes to one direction
-    lean_north, lean_east = p[0], p[1]
-    plate_up, plate_right = p[29], p[30]
+    receiver[M.target_enu : M.target_enu + 3] = target[:3]
+    aside[:] = 0.0
+    aside[M.sigma_rad] = 1.0  # a row whose light comes from and goes to one direction
+    plate_up, plate_right = p[P.receiver_plane_up_rad], p[P.receiver_plane_right_rad]
     _prepare(model, k, known)
     for s in range(first, end):
         g = step0 + s
         tick = g % loop.interval == 0
         if s % 16 == 0 or s == first:
             # wherever a stretch is cut, the same lean
-            p[0] = lean_north + lean[0] * heat[s - s % 16]
-            p[1] = lean_east + lean[1] * heat[s - s % 16]
+            p[P.pedestal_tilt_north_rad] = built[P.pedestal_tilt_north_rad] + lean[0] * heat[s - s % 16]
+            p[P.pedestal_tilt_east_rad] = built[P.pedestal_tilt_east_rad] + lean[1] * heat[s - s % 16]
             _prepare(p, k, prepared)
         # where the model says the motors belong, now and one interval ahead
         if duty == GO:
@@ -322,7 +520,7 @@ def _track(
                 seen[:] = sun[s]
                 if math.isfinite(age[word]):
                     _carried(heard[word], loop.turn * (age[word] + s - first), loop, seen)
-                reached = _command(model, k, known, row, seen, counts, work)
+                reached = _command(model, k, known, row, is_dish, seen, counts, work)
                 if reached:
                     _nearest_turn(state[NEXT] if fresh else state[MOTOR], k, counts)
                     state[NEXT], state[NEXT + 1] = counts[0], counts[1]
@@ -330,7 +528,7 @@ def _track(
             seen[:] = sun[s + ahead]
             if math.isfinite(age[word]):
                 _carried(heard[word], loop.turn * (age[word] + s - first + ahead), loop, seen)
-            reached = _command(model, k, known, row, seen, counts, work) and reached
+            reached = _command(model, k, known, row, is_dish, seen, counts, work) and reached
             shift = state[SHIFT : SHIFT + 3]
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
                 reached = _shifted(model, k, known, shift, counts, guess, aside, work)
@@ -386,8 +584,8 @@ def _track(
                     h = _across(guess, change, across)
                     for a in range(2):
                         turn = -across[0] / h if a == 0 else across[1]
-                        state[COMMAND + a] += turn * k[13 + a]
-                        state[NEXT + a] += turn * k[13 + a]
+                        state[COMMAND + a] += turn * k[K.counts_per_unit + a]
+                        state[NEXT + a] += turn * k[K.counts_per_unit + a]
                 if loop.learn > 0:
                     state[INNOVATION] += entry[4]
                     state[INNOVATION + 1] += entry[5]
@@ -426,14 +624,14 @@ def _track(
         for a in range(2):
             want = state[COMMAND + a]
             if duty != GO:
-                want += (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[13 + a]
-                want = min(max(want, k[22 + 2 * a]), k[23 + 2 * a])
+                want += (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[K.counts_per_unit + a]
+                want = min(max(want, k[K.lowest_count + a]), k[K.highest_count + a])
             before = state[MOTOR + a]
             change[a] = state[AXIS + a]
             state[MOTOR + a], state[AXIS + a], state[GOAL + a] = stepper_step(
                 want, before, state[AXIS + a], state[GOAL + a], drive_1 if a == 0 else drive_2, 1.0
             )
-            change[a] = (state[AXIS + a] - change[a]) / k[13 + a]
+            change[a] = (state[AXIS + a] - change[a]) / k[K.counts_per_unit + a]
             move = state[MOTOR + a] - before
             total[MOTOR_1 + a] += abs(move)
             if move != 0.0 and state[MOVED + a] == 0.0:
@@ -451,9 +649,9 @@ def _track(
             up += state[SWING + 2]
         _bend(true, right, up)
         for i in range(3):
-            row[i] = receiver[i] = sun[s, i]
+            row[M.source_enu + i] = receiver[M.source_enu + i] = sun[s, i]
             if is_dish:
-                row[4 + i] = receiver[4 + i] = sun[s, i]
+                row[M.target_enu + i] = receiver[M.target_enu + i] = sun[s, i]
         angle = _off(row, true, wanted)
         facing = max(true[0] * sun[s, 0] + true[1] * sun[s, 1] + true[2] * sun[s, 2], 0.0)
         if tick or s % stride == 0 or s == end - 1:
@@ -508,7 +706,7 @@ def _track(
                 if emerged:
                     total[BURSTS] += 1.0
                     total[BURST_ERROR] += angle
-                    total[TURNING] += angle * k[13] / drive_1.speed * loop.servo_s
+                    total[TURNING] += angle * k[K.counts_per_unit] / drive_1.speed * loop.servo_s
                 if dark:
                     by_outage[outage[s] - 1, OUT_STEPS] += 1.0
                     by_outage[outage[s] - 1, OUT_SQUARE] += angle * angle
@@ -553,8 +751,20 @@ def _track(
                     total[FRAMES_LOST] += 1.0
                 continue
             # measured minus known tilt of the plate is the mirror as the loop sees it
-            right = plate_right + drift * heat[s] + bias[0] + spread[0] * noise[frame, 0] - model[30]
-            up = plate_up + bias[1] + spread[1] * noise[frame, 0] + spread[2] * noise[frame, 1] - model[29]
+            right = (
+                plate_right
+                + drift * heat[s]
+                + bias[0]
+                + spread[0] * noise[frame, 0]
+                - model[P.receiver_plane_right_rad]
+            )
+            up = (
+                plate_up
+                + bias[1]
+                + spread[1] * noise[frame, 0]
+                + spread[2] * noise[frame, 1]
+                - model[P.receiver_plane_up_rad]
+            )
             for i in range(3):
                 error[i] = true[i] - guess[i]
             _across(true, error, across)
@@ -567,7 +777,7 @@ def _track(
             _along(true, across[0] - right, across[1] - up, entry[1:4])
         elif loop.feedback == ENCODER:
             for a in range(2):
-                here = (axis_1 if a == 0 else axis_2) - p[3 + a]
+                here = (axis_1 if a == 0 else axis_2) - p[P.axis_1_zero_rad + a]
                 read = math.floor(here / loop.level + 0.5) * loop.level
                 entry[1 + a] = _axis(a, state[COMMAND + a], model, k, known) - read
         else:
@@ -575,72 +785,20 @@ def _track(
                 error[i] = sun[s, i] - true[i]
             _across(true, error, across)
             for a in range(2):
-                read = across[a] + sensor[a] + drift * heat[s]
+                read = across[a] + null[a] + drift * heat[s]
                 read = min(max(read, -loop.reach), loop.reach * (1.0 - 1e-9))
                 across[a] = (math.floor(read / loop.level) + 0.5) * loop.level
             _along(true, across[0], across[1], entry[1:4])
             if not power[s] > 0.0:
                 entry[0] = LOST
-    p[0], p[1] = lean_north, lean_east
 
 
 @kernel
-def advance_some(
-    row, end_row,
-    loop, law, drive_1, drive_2, table,
-    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
-    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
-    stride, trace_error, trace_light, stored, trace, light,
-):  # fmt: skip
-    """Take mirrors ``row`` to before ``end_row`` through a stretch, one after the other; see `advance`."""
-    scratch = np.empty(N_SCRATCH)
-    for h in range(row, end_row):
-        keeps = stored[h] >= 0
-        _track(
-            loop, law, drive_1, drive_2, table,
-            step0, first, end, duty[h], renew[h] > 0, scored[h] > 0, mode[h], aim[h], goal[h], heard[h], age[h],
-            p[h], k[h], lean[h], heat, model[h], cov[h], free, scale, walk, sun, target[h], gust[h],
-            mean_speed, bend, swing[h], noise[h], spread[h], bias[h], lost[h], outage[h], power, drift[h],
-            sensor[h], state[h], ring[h], total[h], by_mode[h], by_outage[h], hours[h], hour_of, histogram[h],
-            stride, trace_error[h], trace_light[h], trace[max(stored[h], 0)], keeps, light[h], scratch,
-        )  # fmt: skip
+def advance(row, end_row, first, end, tasks, stretch):
+    """Take mirrors ``row`` to before ``end_row`` through steps ``first`` to before ``end`` of a stretch, in place.
 
-
-@kernel_parallel
-def advance(
-    loop, law, drive_1, drive_2, table,
-    step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
-    p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-    bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
-    stride, trace_error, trace_light, stored, trace, light,
-):  # fmt: skip
-    """Take all mirrors through steps ``first`` to ``end`` of a stretch, in place of ``model, cov, state, ring``, sums.
-
-    ``law`` turns errors into speeds; ``drive_1, drive_2`` are in counts, a servo step being one unit of time. First
-    axis is the mirror; step ``s`` of the stretch is step ``step0 + s`` of the day. ``table`` of captures.
-
-    What mirrors are told: ``duty``; ``renew``: at the first step it or the aim is another than before; ``scored``: on
-    the receiver; ``mode`` row of ``by_mode``; ``aim`` (xyz); ``goal`` (2) counts; ``heard`` (interval, xyz) sun, so
-    many steps ``age`` (interval) before the first step; NaN: the sun is known.
-
-    ``p, k`` true mount; ``lean`` (2) of the pedestal by day, times ``heat`` (step); ``model`` what the controller
-    believes; ``cov, free, scale, walk`` of its rolling fit; ``sun`` (step + interval + 1, xyz); ``target`` (xyz, 1 for
-    a dish); ``gust`` (step) [m/s]; ``bend`` (2) [rad/(m/s)²]; ``swing`` (step, 4) and ``noise`` (frame, 2) of variance
-    one, ``spread`` (3) its lower triangle [rad], ``bias`` (2) [rad]: right, up; ``lost`` (frame), ``outage`` (step):
-    0, or which one is on, from 1; ``power`` (step) [W/m²], negative outside the field's hours;
-    ``drift`` of plate or sensor [rad]; ``trace_error``,
-    ``trace_light`` (trace, 2); ``stored`` row of ``trace`` or −1; ``trace`` (stored, trace, 8); ``light`` (2) caught
-    and offered, as parts of the beam, at the last step.
+    ``tasks`` and ``stretch`` are `Tasks` and `Stretch`; mirrors know nothing of each other.
     """
-    n = p.shape[0]
-    share = max(n // N_BLOCK, 1)
-    for block in prange((n + share - 1) // share):
-        advance_some(
-            block * share, min((block + 1) * share, n),
-            loop, law, drive_1, drive_2, table,
-            step0, first, end, duty, renew, scored, mode, aim, goal, heard, age,
-            p, k, lean, heat, model, cov, free, scale, walk, sun, target, gust, mean_speed, bend, swing, noise, spread,
-            bias, lost, outage, power, drift, sensor, state, ring, total, by_mode, by_outage, hours, hour_of, histogram,
-            stride, trace_error, trace_light, stored, trace, light,
-        )  # fmt: skip
+    room = _workspace()
+    for h in range(row, end_row):
+        _track(h, first, end, tasks, stretch, room)

@@ -24,132 +24,43 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfpose import geometry
-from rfpose.checks import FloatArray, as_positive
+from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels as mount_kernels
-from rfpose.feedback.calibrated import PARAMETER_SETS
-from rfpose.feedback.drone import drone_sigma_rad
+from rfpose.feedback.columns import M, P, columns_of, scales_of
 from rfpose.feedback.energy import combine_errors_rad, energy, representative_days
-from rfpose.feedback.mount import PARAMETERS, aim_rows
-from rfpose.feedback.servo import PiLaw
+from rfpose.feedback.mount import aim_rows
 from rfpose.feedback.servo.margins import is_stable
-from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking import _kernels
-from rfpose.feedback.tracking.capture import TOP_RAD, capture_table
-from rfpose.feedback.tracking.hidden import Field, draw_field
-from rfpose.feedback.tracking.instruments import _LARGE, _PRIORS, _TURNS, _WORMS, LEARNED, Workshop
+from rfpose.feedback.tracking.calibrations import (
+    STEEP,
+    Calibration,
+    calibration_of,
+    posture_scatter_rad,
+    prior_sigma,
+)
+from rfpose.feedback.tracking.capture import TOP_RAD
+from rfpose.feedback.tracking.hidden import MONTH_DAYS, PLACE, WORMS, sigma_as_built
+from rfpose.feedback.tracking.instruments import RadioPoses
+from rfpose.feedback.tracking.loops import loop_of
 from rfpose.feedback.tracking.methods import Method, choose
+from rfpose.feedback.tracking.plant import Plant
+from rfpose.feedback.tracking.postures import Postures
 from rfpose.feedback.tracking.radio import RadioModel
-from rfpose.feedback.tracking.sky import under_sky
-from rfpose.feedback.tracking.timeline import Day, days, hour_of_day, site_of
-from rfpose.feedback.tracking.wind import Gusts
+from rfpose.feedback.tracking.sampled_loop import SampledLoop
+from rfpose.feedback.tracking.timeline import Day, site_of
 from rfpose.scenario import Scenario
 
 __all__ = ["Budget", "SampledLoop", "mean_intercept", "track_budget"]
 
-_INDEX = {name: i for i, name in enumerate(PARAMETERS)}
-_MOUNT = (
-    "pedestal_tilt_north_rad", "pedestal_tilt_east_rad", "axis_1_zero_rad", "axis_2_zero_rad", "nonorthogonality_rad",
-    "canting_up_rad", "canting_right_rad", "gravity_sag_rad",
-)  # fmt: skip
-_PLACE = ("location_east_m", "location_north_m", "location_up_m")
-_ZEROS = ("axis_1_zero_rad", "axis_2_zero_rad")
-_N_MIRROR, _N_DAY, _N_TIME, _N_RADIO = 48, 12, 48, 6
+_N_MIRROR, _N_DAY, _N_TIME = 48, 12, 48
 _HARMONICS = np.arange(1, 17)
-_STEEP = 0.3
-_MONTH_DAYS = 30.4375
+_LINES = _HARMONICS**-2.0 / np.sum(_HARMONICS**-2.0)
+"""What part of a sawtooth's square each of its harmonics has."""
+_TILTS = ("pedestal_tilt_north_rad", "pedestal_tilt_east_rad")
 
-
-# -- the loop ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SampledLoop:
-    """A PI law on a measurement of the mirror, as the tracking simulation runs it: the mirror follows at once.
-
-    Attributes
-    ----------
-    gain_per_s, integral_gain_per_s2
-        K0, K1.
-    interval_s, latency_s
-        Between measurements, and from one to the step in which it acts; in whole servo steps, at least one.
-    servo_s
-        Between servo steps, at which errors count.
-    lost
-        Part of the measurements that do not arrive.
-    """
-
-    gain_per_s: float
-    integral_gain_per_s2: float = 0.0
-    interval_s: float = 1.0
-    latency_s: float = 1.0
-    servo_s: float = 1.0
-    lost: float = 0.0
-
-    def __post_init__(self) -> None:
-        as_positive("interval_s", self.interval_s)
-        as_positive("servo_s", self.servo_s)
-        if not 0.0 <= self.lost <= 1.0:
-            raise InvalidInputError(f"`lost` must be a part, 0 to 1, got {self.lost}")
-
-    def _shape(self) -> tuple[int, int]:
-        """Return servo steps between measurements, and from one to where it acts."""
-        late = max(int(np.ceil(self.latency_s / self.servo_s - 1e-9)), 1)
-        return max(round(self.interval_s / self.servo_s), 1), late
-
-    def _shift(self, frequency_hz: FloatArray) -> npt.NDArray[np.complex128]:
-        """Return what the loop shifts the mirror by, for a swinging error of one, from one measurement to the next."""
-        n, late = self._shape()
-        interval, here = self.interval_s, 1.0 - self.lost
-        # the loop takes away all that stands still
-        z = np.exp(2j * np.pi * np.maximum(np.abs(frequency_hz), 1e-9) * interval)
-        forward = (
-            here * interval * (self.gain_per_s + self.integral_gain_per_s2 * interval * z / (z - 1.0)) * z / (z - 1.0)
-        )
-        return np.asarray(forward / (1.0 + forward * z ** -float(-(-late // n))), np.complex128)
-
-    def left(self, frequency_hz: npt.ArrayLike) -> FloatArray:
-        """Return what part of a swinging error is left, rms over the servo steps between measurements.
-
-        Parameters
-        ----------
-        frequency_hz : (...)
-            May lie above half the sampling rate: what is sampled too rarely is followed falsely, and counts.
-        """
-        frequency = np.asarray(frequency_hz, np.float64)
-        n, late = self._shape()
-        shift = self._shift(frequency)
-        square = np.zeros(frequency.shape)
-        for step in range(n):
-            turn = np.exp(2j * np.pi * frequency * self.servo_s * step)
-            behind = np.exp(2j * np.pi * frequency * self.interval_s * ((step - late) // n))
-            square += np.abs(turn - shift * behind) ** 2
-        return np.asarray(np.sqrt(square / n))
-
-    @property
-    def passed(self) -> float:
-        """Rms of the mirror for white measurement noise of rms one."""
-        frequency = (np.arange(8192) + 0.5) * 0.5 / 8192 / self.interval_s
-        # noise comes at the full gain, but with what arrives only
-        return float(np.sqrt(np.mean(np.abs(self._shift(frequency)) ** 2) / max(1.0 - self.lost, 1e-9)))
-
-    def start_rms(self, settle_s: float, span_s: float) -> float:
-        """Return the rms that an initial error of one leaves over a span that begins some time after the start."""
-        n, late = self._shape()
-        here = 1.0 - self.lost
-        length = int(np.ceil((settle_s + span_s) / self.servo_s))
-        length = min(length, int(settle_s / self.servo_s) + 4000 * n)
-        error, pending = np.empty(length), np.zeros(length + late + 1)
-        shift = ramp = 0.0
-        for g in range(length):
-            shift += pending[g]
-            error[g] = 1.0 - shift
-            if g % n == 0:
-                ramp += here * self.integral_gain_per_s2 * self.interval_s * error[g]
-                pending[g + late] += self.interval_s * (here * self.gain_per_s * error[g] + ramp)
-        after = error[int(settle_s / self.servo_s) :]
-        return float(np.sqrt(np.sum(after**2) * self.servo_s / span_s))
+Squares = dict[str, FloatArray]
+"""Squared errors by part, (mirror, time) or what broadcasts to it [rad²]."""
 
 
 # -- result ------------------------------------------------------------------------------------------------------------
@@ -299,33 +210,42 @@ def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -
         As `rfpose.feedback.tracking.Simulation` does, but for gains, which may have any margin above none.
     """
     chosen = choose((method,), collector=scenario.tracking.collector)[0]
-    return _Budgeter(scenario, chosen, count).budget()
+    return _Propagation(scenario, chosen, count).budget()
 
 
-# -- geometry ----------------------------------------------------------------------------------------------------------
+# -- where it comes from -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Course:
-    """Postures of mirrors over times: (mirror, time, …)."""
+class _Tracked:
+    """Part of a day while it counts: postures of the nominal mirrors, and how fast their axes turn."""
 
-    sun_enu: FloatArray = field(repr=False)
-    """(time, xyz)"""
-    heat: FloatArray
-    normal_enu: FloatArray
-    centre_enu_m: FloatArray
-    count: FloatArray
-    rows: FloatArray
-    seen: npt.NDArray[np.bool_]
+    day: Day
+    at: npt.NDArray[np.int64]
+    """(time,) steps that stand for all, """
+    span_s: float
+    """which last so long."""
+    postures: Postures
+    speed: FloatArray = field(repr=False)
+    """(mirror, time, axis) [rad/s]"""
 
     @property
-    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Right and up (mirror, time, xyz), cosine of the elevation (mirror, time)."""
-        rot = geometry.rot_enu_from_mirror(self.normal_enu)
-        return rot[..., 0], rot[..., 1], np.hypot(self.normal_enu[..., 0], self.normal_enu[..., 1])
+    def across(self) -> tuple[FloatArray, FloatArray]:
+        """(mirror, time) what the normal turns by when axis 1 or axis 2 turns by one."""
+        cosine = self.postures.cos_elevation
+        return cosine, np.ones_like(cosine)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Looked:
+    """A calibration so many days after the run's first: its looks, and what it makes of them."""
+
+    calibration: Calibration
+    since_first: int
+    looks: Postures
+
+
+@dataclass(frozen=True, slots=True)
 class _Source:
     """Something that makes mirrors point elsewhere, of variance one: at the looks (…, xyz) and while tracking."""
 
@@ -334,159 +254,119 @@ class _Source:
     track: FloatArray | None
 
 
-class _Budgeter:
-    """Builds one budget."""
+class _Propagation:
+    """Propagates the errors of one method."""
 
     def __init__(self, scenario: Scenario, method: Method, count: int | None) -> None:
         plan = scenario.tracking
+        if plan.sky == "bursts":  # what they cut off is not the method's doing
+            scenario = scenario.model_copy(update={"tracking": plan.model_copy(update={"sky": "clear"})})
         self._scenario, self._method, self._plan = scenario, method, plan
-        self._site = site_of(scenario)
-        every = days(scenario)
-        if plan.sky == "record":
-            every = under_sky(scenario, every, seed=0)
-        self._every = every
-        self._days = [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_N_DAY, len(every))).astype(int))]
-        course = every[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
-        whole = draw_field(scenario, count=count, seed=0, sun_enu=course)
-        self._some = np.unique(np.linspace(0, len(whole) - 1, min(_N_MIRROR, len(whole))).astype(np.int64))
-        self._field = _part_of(whole, self._some)
-        self._gusts = Gusts(scenario)
-        self._dish = plan.collector == "dish"
-        self._radio: RadioModel | None = None
+        self._plant = plant = Plant(scenario, count=count, seed=0).sample(_N_MIRROR)
+        self._field, self._gusts = plant.field, plant.gusts
+        self._loop = loop_of(scenario, method.feedback)
+        self._radio: RadioPoses | None = None
+        model: RadioModel | None = None
         if method.radio:
             self._check_stable()
-            noon = every[0].sun_enu[int(np.argmax(every[0].sun_enu[:, 2]))]
-            self._radio = RadioModel(scenario, self._field.pivot_enu_m, usual_normal_enu=self._wanted(noon[None])[:, 0])
-        self._workshop = Workshop(scenario, self._field, self._radio, self._gusts, seed=0)
-        self._step = 2.0 * np.pi * plan.drive.microsteps / plan.drive.steps_per_turn
-        self._loop = self._loop_of()
-        self._mirror = method.feedback in (_kernels.RADIO, _kernels.SUN_SENSOR)
-        self._square: dict[str, FloatArray] = {}
+            model = RadioModel(scenario, plant.field.pivot_enu_m, usual_normal_enu=plant.usual_normal_enu())
+            self._radio = RadioPoses(plant, model)
+        self._calibration = calibration_of(method.knowledge, plant, model)
+        self._sees_mirror = method.feedback in (_kernels.RADIO, _kernels.SUN_SENSOR)
+        self._sigma = sigma_as_built(scenario) | self._fixed()
 
     def _check_stable(self) -> None:
-        plan = self._plan
-        interval, late = plan.control_interval_s, plan.radio.latency_s
-        law = PiLaw(
-            gain_per_s=plan.radio.gain_per_s, integral_gain_per_s2=plan.radio.integral_gain_per_s2, levels=0
-        )  # fmt: skip
-        beyond = max(int(np.ceil(late / interval - 1e-9)) - 1, 0)
-        if not is_stable(law, None, interval_s=interval, latency_s=beyond * interval):
+        loop = loop_of(self._scenario, _kernels.RADIO)
+        assert loop is not None
+        if not is_stable(loop.law, None, interval_s=loop.interval_s, latency_s=loop.delay_s):
             raise InvalidInputError("[tracking.radio] these gains oscillate: no budget tells how far; lower them")
 
-    def _loop_of(self) -> SampledLoop | None:
-        plan, servo = self._plan, self._plan.servo_interval_s
-        if self._method.feedback == _kernels.RADIO:
-            return SampledLoop(
-                gain_per_s=plan.radio.gain_per_s, integral_gain_per_s2=plan.radio.integral_gain_per_s2,
-                interval_s=plan.control_interval_s, latency_s=plan.radio.latency_s, servo_s=servo,
-                lost=plan.radio.lost_frames,
-            )  # fmt: skip
-        if self._method.feedback == _kernels.ENCODER:
-            return SampledLoop(gain_per_s=plan.encoder.gain_per_s, interval_s=servo, latency_s=servo, servo_s=servo)
-        if self._method.feedback == _kernels.SUN_SENSOR:
-            sensor = plan.sun_sensor
-            return SampledLoop(
-                gain_per_s=sensor.gain_per_s, integral_gain_per_s2=sensor.integral_gain_per_s2, interval_s=servo,
-                latency_s=servo, servo_s=servo,
-            )  # fmt: skip
-        return None
+    def _fixed(self) -> dict[str, float]:
+        """Return parameters that all mirrors have alike: such a one counts with all of its value."""
+        nominal, fixed = self._field.nominal[0], self._plan.mount_errors.fixed
+        # the receivers' plane is drawn apart
+        return {
+            name: abs(value - float(nominal[getattr(P, name)]))
+            for name, value in fixed.items()
+            if not name.startswith("receiver_plane")
+        }
 
     def budget(self) -> Budget:
         """Return the budget: parts are averaged over days, mirrors and times."""
+        every, table = self._plant.days, self._plant.table
         squares: list[dict[str, float]] = []
-        table = capture_table(self._scenario)
         light = np.zeros(2)
-        for day in self._days:
-            self._square = {}
-            light += self._of_day(day, table)
-            squares.append({name: float(np.nanmean(value)) for name, value in self._square.items()})
+        for i in np.unique(np.linspace(0, len(every) - 1, min(_N_DAY, len(every))).astype(int)):
+            tracked = self._tracked(every[i])
+            found = self._squares(tracked)
+            light += self._light(tracked, found)
+            squares.append({name: float(np.nanmean(value)) for name, value in found.items()})
         parts = {f"{name}_rad": float(np.sqrt(np.mean([s[name] for s in squares]))) for name in squares[0]}
-        found = Budget(method=self._method.name, **parts)
+        budget = Budget(method=self._method.name, **parts)
         day_kwh, year_kwh = self._offered_kwh()
         return dataclasses.replace(
-            found,
-            intercept=float(mean_intercept(table, found.total_rad)),
+            budget,
+            intercept=float(mean_intercept(table, budget.total_rad)),
             posture_intercept=float(light[0] / light[1]) if light[1] > 0.0 else float("nan"),
             perfect_intercept=float(table[0]),
             offered_kwh_per_m2=day_kwh,
             offered_kwh_per_m2_year=year_kwh,
         )
 
-    def _add(self, part: str, square: npt.ArrayLike) -> None:
-        self._square[part] = self._square.get(part, np.zeros(())) + np.asarray(square)
-
-    def _of_day(self, day: Day, table: FloatArray) -> FloatArray:
-        """Collect a day's squares by part (mirror, time), or what broadcasts to it; return light caught and offered."""
-        scored = np.flatnonzero(
-            day.works & (np.arange(len(day.unix_s)) * self._plan.servo_interval_s >= self._plan.settle_s)
-        )
-        if not scored.size:
-            scored = np.arange(len(day.unix_s))
-        at = scored[np.linspace(0, len(scored) - 1, min(_N_TIME, len(scored))).astype(np.int64)]
-        course = self._course(day.sun_enu[at], day.heat[at], self._field.target[:, :3])
-        speed = self._speed(day, at, course)
-        span_s = len(scored) * self._plan.servo_interval_s
-        self._of_drive(course, speed)
-        self._of_wind()
+    def _squares(self, tracked: _Tracked) -> Squares:
+        """Return a day's squares by part."""
+        found = self._of_drive(tracked) | self._of_wind()
         if self._method.feedback == _kernels.RADIO:
-            self._of_radio(course)
+            found |= self._of_radio(tracked)
         if self._method.feedback == _kernels.SUN_SENSOR:
-            self._of_sensor(course)
-        self._of_model(day, course, speed, span_s)
-        shape = course.count.shape[:2]
-        total = np.sqrt(sum((np.broadcast_to(value, shape) for value in self._square.values()), np.zeros(shape)))
-        power = day.power_w_per_m2[at] * np.sum(course.normal_enu * course.sun_enu, axis=-1)
-        power = np.where(np.isfinite(total), power, 0.0)
-        caught = mean_intercept(table, np.nan_to_num(total))
+            found |= self._of_sensor(tracked)
+        return found | self._of_model(tracked)
+
+    def _light(self, tracked: _Tracked, squares: Squares) -> FloatArray:
+        """Return light caught and offered, each posture with its own errors."""
+        shape = tracked.postures.seen.shape
+        total = np.sqrt(sum((np.broadcast_to(value, shape) for value in squares.values()), np.zeros(shape)))
+        facing = np.sum(tracked.postures.normal_enu * tracked.postures.sun_enu, axis=-1)
+        power = np.where(np.isfinite(total), tracked.day.power_w_per_m2[tracked.at] * facing, 0.0)
+        caught = mean_intercept(self._plant.table, np.nan_to_num(total))
         return np.array([np.sum(power * caught), np.sum(power)])
 
     # -- where mirrors stand ---------------------------------------------------------------------------------
 
-    def _wanted(self, sun_enu: FloatArray) -> FloatArray:
-        """(mirror, time, xyz) normals."""
-        shape = (len(self._field), len(sun_enu), 3)
-        if self._dish:
-            return np.broadcast_to(sun_enu, shape).copy()
-        towards = self._field.target[:, None, :3] - self._field.pivot_enu_m[:, None]
-        return geometry.bisector_enu(np.broadcast_to(towards, shape), np.broadcast_to(sun_enu, shape))
+    def _tracked(self, day: Day) -> _Tracked:
+        servo_s = self._plan.servo_interval_s
+        scored = np.flatnonzero(day.works & (np.arange(len(day.unix_s)) * servo_s >= self._plan.settle_s))
+        if not scored.size:
+            scored = np.arange(len(day.unix_s))
+        at = scored[np.linspace(0, len(scored) - 1, min(_N_TIME, len(scored))).astype(np.int64)]
+        postures = self._plant.nominal_postures(day.sun_enu[at], day.heat[at], self._field.target[:, :3])
+        right, up = postures.right_up
+        now, later = (np.stack([self._plant.wanted_normal_enu(day, i) for i in at + ahead], axis=1) for ahead in (0, 1))
+        moved = (later - now) / servo_s
+        across = np.sum(moved * right, axis=-1) / np.maximum(postures.cos_elevation, 0.05)
+        speed = np.stack([across, np.sum(moved * up, axis=-1)], axis=-1)
+        return _Tracked(day=day, at=at, span_s=len(scored) * servo_s, postures=postures, speed=speed)
 
-    def _course(self, sun_enu: FloatArray, heat: FloatArray, target: FloatArray) -> _Course:
-        """Return the nominal mirrors' postures that send the sun to targets (mirror, xyz)."""
-        shape = (len(self._field), len(sun_enu), 3)
-        sun = np.broadcast_to(sun_enu, shape)
-        goal = sun if self._dish else np.broadcast_to(target[:, None], shape)
-        rows = aim_rows(sun, goal, source_is_point=False, target_is_point=not self._dish)
-        nominal, constant = self._field.nominal, self._field.constant
-        count, _ = mount_kernels.command_batch(nominal, constant, np.ascontiguousarray(rows))
-        seen = np.isfinite(count).all(axis=-1)
-        out = mount_kernels.posture_batch(nominal, constant, np.where(seen[..., None], count, 0.0), 0.0)
-        return _Course(
-            sun_enu=sun_enu, heat=heat, normal_enu=out[..., 2:5], centre_enu_m=out[..., 5:],
-            count=np.where(seen[..., None], count, 0.0), rows=rows, seen=seen,
-        )  # fmt: skip
-
-    def _jacobian(self, course: _Course, names: tuple[str, ...], *, direct: bool, receiver: bool = False) -> FloatArray:
+    def _jacobian(
+        self, postures: Postures, names: tuple[str, ...], *, direct: bool = False, of_receiver_plane: bool = False
+    ) -> FloatArray:
         """(mirror, time, xyz, name) of the normal less the wanted one; ``direct``: of the normal itself."""
-        rows = course.rows
+        rows = postures.rows
         if direct:
-            rows = aim_rows(course.normal_enu, course.normal_enu, source_is_point=False, target_is_point=False)
-            rows[..., 9] = float(receiver)
-        index = np.array([_INDEX[name] for name in names], np.int64)
-        scale = np.array([PARAMETERS[name] for name in names])
+            rows = aim_rows(postures.normal_enu, postures.normal_enu, source_is_point=False, target_is_point=False)
+            rows[..., M.of_receiver_plane] = float(of_receiver_plane)
         return np.asarray(
             mount_kernels.jacobian_batch(
-                self._field.nominal, self._field.constant, course.count, np.ascontiguousarray(rows), course.seen, index,
-                scale,
+                self._field.nominal, self._field.constant, postures.count, np.ascontiguousarray(rows), postures.seen,
+                columns_of(names), scales_of(names),
             )
         )  # fmt: skip
 
-    def _speed(self, day: Day, at: npt.NDArray[np.int64], course: _Course) -> FloatArray:
-        """(mirror, time, axis) speeds of the axes [rad/s]."""
-        beyond = day.sun_enu[at + 1]
-        right, up, cosine = course.axes
-        moved = (self._wanted(beyond) - self._wanted(course.sun_enu)) / self._plan.servo_interval_s
-        return np.stack(
-            [np.sum(moved * right, axis=-1) / np.maximum(cosine, 0.05), np.sum(moved * up, axis=-1)], axis=-1
+    def _seen_jacobian(self, looked: _Looked, names: tuple[str, ...]) -> FloatArray:
+        """Return the same of what a calibration's instrument sees."""
+        instrument = looked.calibration.instrument
+        return self._jacobian(
+            looked.looks, names, direct=not instrument.sees_spots, of_receiver_plane=instrument.sees_receiver_plane
         )
 
     def _left(self, frequency_hz: npt.ArrayLike) -> FloatArray:
@@ -496,38 +376,34 @@ class _Budgeter:
 
     # -- drives ----------------------------------------------------------------------------------------------
 
-    def _of_drive(self, course: _Course, speed: FloatArray) -> None:
-        drive = self._plan.drive
-        cosine = course.axes[2]
-        # teeth of the error: so wide, about a middle that lags behind
+    def _of_drive(self, tracked: _Tracked) -> Squares:
+        drive, step = self._plan.drive, self._plan.drive.step_rad
+        # a sawtooth of the error: so wide, about a middle that lags behind
         wait = max(drive.dead_band_steps / drive.microsteps, 0.5) if drive.dead_band_steps > 0.0 else 0.5
-        width = max(np.floor(wait + 0.5), 1.0) * self._step
-        lag = wait * self._step - 0.5 * width
-        per_s = np.abs(speed)
-        lines = _HARMONICS**-2.0 / np.sum(_HARMONICS**-2.0)
-        for axis, across in enumerate((cosine, np.ones_like(cosine))):
-            tooth_hz = per_s[..., axis, None] / width * _HARMONICS
-            left = self._hunting(self._left(tooth_hz))
-            self._add("motor_steps", across**2 * width**2 / 12.0 * (left @ lines))
+        width = max(np.floor(wait + 0.5), 1.0) * step
+        lag = wait * step - 0.5 * width
+        zero = np.zeros(tracked.postures.seen.shape)
+        found: Squares = {"motor_steps": zero}
+        if self._gusts.swings:
+            found["motor_swing"] = zero
+        found["play"] = zero
+        for axis, across in enumerate(tracked.across):
+            speed = tracked.speed[..., axis]
+            tooth_hz = np.abs(speed)[..., None] / width * _HARMONICS
+            left = _hunting(self._left(tooth_hz))
+            saw = across**2 * width**2 / 12.0
+            found["motor_steps"] = found["motor_steps"] + saw * (left @ _LINES)
             if self._gusts.swings:
-                self._add("motor_swing", across**2 * width**2 / 12.0 * ((left * self._stirred(tooth_hz)) @ lines))
+                found["motor_swing"] = found["motor_swing"] + saw * ((left * self._stirred(tooth_hz)) @ _LINES)
             slow = np.abs(lag) + 1e-3 * (0.5 * drive.backlash_mrad[axis] + 0.5 * drive.stiction_mrad[axis])
-            self._add("play", across**2 * self._of_play(slow, per_s[..., axis], speed[..., axis]))
+            found["play"] = found["play"] + across**2 * self._of_play(slow, speed)
             stuck = 1e-3 * drive.stiction_mrad[axis]
             if stuck > 0.0:
-                left = self._hunting(self._left(per_s[..., axis, None] / stuck * _HARMONICS))
-                self._add("stiction", across**2 * stuck**2 / 12.0 * (left @ lines))
+                left = _hunting(self._left(np.abs(speed)[..., None] / stuck * _HARMONICS))
+                found["stiction"] = found.get("stiction", zero) + across**2 * stuck**2 / 12.0 * (left @ _LINES)
+        return found
 
-    @staticmethod
-    def _hunting(left: FloatArray) -> FloatArray:
-        """Return the square of what is left of teeth that feedback cannot take away, though it sees them.
-
-        It goes to and fro between two steps, the mean being right: φ(1 − φ) of a step squared, on the average over φ
-        twice the tooth's own 1/12. Teeth too quick for it pass as they are.
-        """
-        return np.asarray(left + 2.0 * np.maximum(1.0 - left, 0.0))
-
-    def _of_play(self, slow_rad: float, per_s: FloatArray, speed: FloatArray) -> FloatArray:
+    def _of_play(self, slow_rad: float, speed: FloatArray) -> FloatArray:
         """Return what an offset that goes with the axis' direction leaves: feedback finds it but after each turn."""
         if self._loop is None:
             return np.full(speed.shape, slow_rad**2)
@@ -537,9 +413,9 @@ class _Budgeter:
 
     def _stirred(self, frequency_hz: FloatArray) -> FloatArray:
         """Return the square of the structure's swing for a motor error of one, swinging."""
-        gusts, servo = self._gusts, self._plan.servo_interval_s
+        servo = self._plan.servo_interval_s
         back = np.exp(-2j * np.pi * frequency_hz * servo)
-        (a, b), (c, d) = gusts.transition.tolist()
+        (a, b), (c, d) = self._gusts.transition.tolist()
         kick = -((1.0 - back) ** 2) / servo
         # x ← Φ (x before + kick of the speed)
         determinant = (1.0 - a * back) * (1.0 - d * back) - b * c * back**2
@@ -547,351 +423,225 @@ class _Budgeter:
 
     # -- wind ------------------------------------------------------------------------------------------------
 
-    def _of_wind(self) -> None:
-        gusts, bend2 = self._gusts, float(np.sum(self._gusts.bend**2))
-        sees = self._mirror and self._loop is not None
-        self._add("gusts", bend2 * (2.0 * gusts.mean_mps) ** 2 * self._gust_variance(sees))
+    def _of_wind(self) -> Squares:
+        gusts = self._gusts
+        left = (2.0 * gusts.mean_mps) ** 2 * self._gust_variance(self._sees_mirror)
+        found: Squares = {"gusts": np.asarray(np.sum(gusts.bend**2) * left)}
         if gusts.swings:
             mode = self._plan.structure
             width = mode.damping * mode.natural_hz
             frequency = np.arange(0.5 * width / 20.0, 4.0 * mode.natural_hz, width / 20.0)
             ratio = (frequency / mode.natural_hz) ** 2
             power = 1.0 / ((1.0 - ratio) ** 2 + 4.0 * mode.damping**2 * ratio)
-            kept = np.sum(power * (self._left(frequency) if sees else 1.0)) / np.sum(power)
-            self._add("resonance", float(np.sum(gusts.swing_sigma_rad**2)) * kept)
+            kept = np.sum(power * (self._left(frequency) if self._sees_mirror else 1.0)) / np.sum(power)
+            found["resonance"] = np.asarray(np.sum(gusts.swing_sigma_rad**2) * kept)
+        return found
 
     def _gust_variance(self, sees: bool) -> float:
-        """Return the variance of gusts that is left [(m/s)²]."""
-        if self._plan.wind.record is not None:
-            return self._record_variance(sees)
-        edges = np.geomspace(1e-6, 50.0, 6000)
-        frequency = np.sqrt(edges[1:] * edges[:-1])
-        power = self._gusts.process.spectrum(frequency) * np.diff(edges)
-        return float(np.sum(power * (self._left(frequency) if sees else 1.0)))
-
-    def _record_variance(self, sees: bool) -> float:
-        """Return the same of a measured record over the first day."""
-        day = self._days[0]
-        gust = self._gusts.run(np.zeros((1, 1)), np.random.default_rng(0), day.unix_s)[0].astype(np.float64)
-        power = np.abs(np.fft.rfft(gust)) ** 2 / len(gust) ** 2
-        power[1:] *= 2.0
-        frequency = np.fft.rfftfreq(len(gust), self._plan.servo_interval_s)
+        """Return the variance of gusts that is left [(m/s)²]; of a record over the first day."""
+        frequency: FloatArray
+        if self._gusts.recorded:
+            day = self._plant.days[0]
+            gust = self._gusts.run(np.zeros((1, 1)), np.random.default_rng(0), day.unix_s)[0].astype(np.float64)
+            power = np.abs(np.fft.rfft(gust)) ** 2 / len(gust) ** 2
+            power[1:] *= 2.0
+            frequency = np.asarray(np.fft.rfftfreq(len(gust), self._plan.servo_interval_s), np.float64)
+        else:
+            edges = np.geomspace(1e-6, 50.0, 6000)
+            frequency = np.sqrt(edges[1:] * edges[:-1])
+            power = self._gusts.process.spectrum(frequency) * np.diff(edges)
         return float(np.sum(power * (self._left(frequency) if sees else 1.0)))
 
     # -- radio and sensors -----------------------------------------------------------------------------------
 
-    def _radio_square(self, course: _Course) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(mirror,) variances of noise to the right and up, and (mirror, 2) squares of a reflection's offset [rad²]."""
+    def _of_radio(self, tracked: _Tracked) -> Squares:
+        assert self._loop is not None
         assert self._radio is not None
-        rng = np.random.default_rng(0)
-        at = np.linspace(0, course.count.shape[1] - 1, _N_RADIO).astype(np.int64)
-        right, up, offset = [], [], []
-        for i in at:
-            errors = self._radio.errors(course.normal_enu[:, i], rng)
-            spread = np.where(errors.solved[:, None], errors.spread_rad, np.nan)
-            right.append(spread[:, 0] ** 2)
-            up.append(spread[:, 1] ** 2 + spread[:, 2] ** 2)
-            offset.append(errors.bias_rad**2)
-        return _mean_known(right), _mean_known(up), np.mean(offset, axis=0)
+        frame = self._radio.expected(tracked.postures)
+        return {
+            "radio_noise": frame.noise.sum(axis=-1)[:, None] * self._loop.passed**2,
+            "reflection": frame.bias.sum(axis=-1)[:, None],
+            "plate": self._radio.constant_variance_rad2().sum(axis=-1)[:, None],
+            "plate_drift": self._radio.drift_sigma_rad(tracked.postures.heat)[None] ** 2,
+        }
 
-    def _of_radio(self, course: _Course) -> None:
-        assert self._loop is not None
-        right, up, offset = self._radio_square(course)
-        self._add("radio_noise", (right + up)[:, None] * self._loop.passed**2)
-        self._add("reflection", offset.sum(axis=-1)[:, None])
-        self._add("plate", self._plate_square().sum(axis=-1)[:, None])
-        self._add("plate_drift", self._plate_drift(course)[None] ** 2)
-
-    def _plate_looks(self) -> tuple[int, int]:
-        """Return the day and number of looks with which the camera finds the plate."""
-        camera = self._plan.camera
-        return -max(int(camera.interval_days // 2), 1), camera.points_per_day
-
-    def _plate_square(self) -> FloatArray:
-        """(mirror, 2) variance of the plate's tilt that its calibration leaves, right and up."""
-        radio, camera = self._plan.radio, self._plan.camera
-        if radio.plate_calibration != "camera":
-            return np.full((len(self._field), 2), (1e-3 * radio.plate_sigma_mrad) ** 2)
-        since, n_look = self._plate_looks()
-        looks = self._looks(since, n_look, self._workshop._camera_target())
-        right, up, _ = self._radio_square(looks)
-        seen = np.mean(self._camera_sigma(looks) ** 2, axis=1)
-        constant = (1e-3 * camera.scale_error_sigma_mrad) ** 2
-        return np.stack([(seen + right) / n_look + constant, (seen + up) / n_look + constant], axis=-1)
-
-    def _plate_drift(self, course: _Course) -> FloatArray:
-        """(time,) tilt to the right that daily warmth leaves."""
-        heat = course.heat
-        if self._plan.radio.plate_calibration == "camera":
-            since, n_look = self._plate_looks()
-            heat = heat - np.mean(self._warmth(self._workshop._times(since, n_look)))
-        return np.asarray(1e-3 * self._plan.radio.plate_drift_mrad * heat)
-
-    def _of_sensor(self, course: _Course) -> None:
-        assert self._loop is not None
-        sensor = self._plan.sun_sensor
-        level, servo = 2e-3 * sensor.range_mrad / sensor.levels, self._plan.servo_interval_s
-        self._add("sensor_null", 2.0 * (1e-3 * sensor.offset_sigma_mrad) ** 2)
-        self._add("sensor_drift", 2.0 * (0.5e-3 * sensor.drift_mrad * course.heat[None]) ** 2)
+    def _of_sensor(self, tracked: _Tracked) -> Squares:
+        sensor, servo = self._plan.sun_sensor, self._plan.servo_interval_s
         # about zero the innermost levels are a relay: to and fro by what half a level moves the mirror in a step
-        moved = servo * (sensor.gain_per_s + 0.5 * servo * sensor.integral_gain_per_s2) * 0.5 * level
-        self._add("sensor_levels", moved**2)
+        moved = servo * (sensor.gain_per_s + 0.5 * servo * sensor.integral_gain_per_s2) * 0.5 * sensor.level_rad
+        return {
+            "sensor_null": np.asarray(2.0 * (1e-3 * sensor.offset_sigma_mrad) ** 2),
+            "sensor_drift": 2.0 * (0.5e-3 * sensor.drift_mrad * tracked.postures.heat[None]) ** 2,
+            "sensor_levels": np.asarray(moved**2),
+        }
 
     # -- what is not known of the mounts ---------------------------------------------------------------------
 
-    def _warmth(self, unix_s: FloatArray) -> FloatArray:
-        return np.asarray(np.cos(2.0 * np.pi * (hour_of_day(unix_s, self._site) - 15.0) / 24.0))
-
-    def _looks(self, since_first: int, n_look: int, target: FloatArray) -> _Course:
-        unix_s = self._workshop._times(since_first, n_look)
-        return self._course(sun_position(unix_s, self._site).direction_enu, self._warmth(unix_s), target)
-
-    def _camera_sigma(self, looks: _Course) -> FloatArray:
-        """(mirror, look) of one direction of the normal [rad]."""
-        distance = np.full(looks.count.shape[:2], 50.0)
-        if not self._dish:
-            distance = np.linalg.norm(looks.rows[..., 4:7] - looks.centre_enu_m, axis=-1)
-        return np.asarray(np.maximum(0.5e-3 * self._plan.camera.spot_sigma_mm / distance, 1e-6))
-
-    def _sigmas(self) -> dict[str, float]:
-        """Return the standard deviation of each parameter as built; a fixed one counts with all of its value."""
-        e = self._plan.mount_errors
-        worm = 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0)
-        sigma = {
-            "pedestal_tilt_north_rad": 1e-3 * e.tilt_sigma_mrad, "pedestal_tilt_east_rad": 1e-3 * e.tilt_sigma_mrad,
-            "axis_1_zero_rad": 1e-3 * e.zero_sigma_mrad, "axis_2_zero_rad": 1e-3 * e.zero_sigma_mrad,
-            "nonorthogonality_rad": 1e-3 * e.nonorthogonality_sigma_mrad,
-            "canting_up_rad": 1e-3 * e.canting_sigma_mrad, "canting_right_rad": 1e-3 * e.canting_sigma_mrad,
-            "gravity_sag_rad": 1e-3 * e.sag_sigma_mrad,
-            **dict.fromkeys(_PLACE, 0.001 * e.location_sigma_mm),
-            **dict.fromkeys(_WORMS, worm),
-        }  # fmt: skip
-        nominal = self._field.nominal[0]
-        fixed = {name: abs(value - float(nominal[_INDEX[name]])) for name, value in e.fixed.items()}
-        # the receivers' plane is drawn apart
-        return sigma | {name: value for name, value in fixed.items() if not name.startswith("receiver_plane")}
-
-    def _of_model(self, day: Day, course: _Course, speed: FloatArray, span_s: float) -> None:
-        """Add what the model does not know, or of closed loops what they cannot see."""
-        before = dict(self._square)
-        self._of_knowledge(day, course, speed)
+    def _of_model(self, tracked: _Tracked) -> Squares:
+        """Return what the model does not know, or of closed loops what they cannot see."""
+        unknown = self._of_knowledge(tracked)
         if self._loop is None:
-            return
-        morning = sum(float(np.nanmean(value - before.get(name, 0.0))) for name, value in self._square.items())
+            return unknown
         if self._method.feedback == _kernels.ENCODER:
-            self._square["worm"] = self._of_worm(course, speed)
-            level = 2.0 * np.pi / 2**self._plan.encoder.bits
-            cosine = course.axes[2]
-            self._add("encoder", (1.0 + cosine**2) * (level / np.sqrt(12.0) * self._loop.passed) ** 2)
-            return
+            one, other = tracked.across
+            level = self._plan.encoder.level_rad / np.sqrt(12.0) * self._loop.passed
+            return unknown | {"worm": self._of_worm(tracked), "encoder": (other + one**2) * level**2}
         # the loop sees normals, not where mirrors stand
-        self._square = before
-        self._add("place", self._of_place(course))
-        self._add("worm", self._of_worm(course, speed))
-        self._add("start", morning * self._loop.start_rms(self._plan.settle_s, span_s) ** 2)
+        morning = sum(float(np.nanmean(value)) for value in unknown.values())
+        return {
+            "place": self._of_place(tracked.postures),
+            "worm": self._of_worm(tracked),
+            "start": np.asarray(morning * self._loop.start_rms(self._plan.settle_s, tracked.span_s) ** 2),
+        }
 
-    def _of_place(self, course: _Course) -> FloatArray:
-        sigma = self._sigmas()
-        names = tuple(sigma)
-        seen = self._jacobian(course, names, direct=False) - self._jacobian(course, names, direct=True)
-        return np.asarray(np.sum((seen * np.array(list(sigma.values()))) ** 2, axis=(-2, -1)))
+    def _of_place(self, postures: Postures) -> FloatArray:
+        names = tuple(self._sigma)
+        seen = self._jacobian(postures, names) - self._jacobian(postures, names, direct=True)
+        return np.asarray(np.sum((seen * np.array(list(self._sigma.values()))) ** 2, axis=(-2, -1)))
 
-    def _of_worm(self, course: _Course, speed: FloatArray) -> FloatArray:
+    def _of_worm(self, tracked: _Tracked) -> FloatArray:
         """Return what feedback leaves of a worm's error, which swings as the axis turns."""
-        sigma = self._sigmas()
-        cosine = course.axes[2]
-        total = np.zeros(cosine.shape)
-        for axis, across in enumerate((cosine, np.ones_like(cosine))):
-            square = sigma[_WORMS[2 * axis]] ** 2 + sigma[_WORMS[2 * axis + 1]] ** 2
-            turns_hz = self._plan.drive.worm_ratio * np.abs(speed[..., axis]) / (2.0 * np.pi)
+        total = np.zeros(tracked.postures.seen.shape)
+        for axis, across in enumerate(tracked.across):
+            square = self._sigma[WORMS[2 * axis]] ** 2 + self._sigma[WORMS[2 * axis + 1]] ** 2
+            turns_hz = self._plan.drive.worm_ratio * np.abs(tracked.speed[..., axis]) / (2.0 * np.pi)
             total += 0.5 * across**2 * square * self._left(turns_hz)
         return total
 
-    def _of_knowledge(self, day: Day, course: _Course, speed: FloatArray) -> None:
+    def _of_knowledge(self, tracked: _Tracked) -> Squares:
         """Propagate all that a model does not know through its calibration to its postures."""
-        knowledge, plan = self._method.knowledge, self._plan
-        workshop, target = self._workshop, self._workshop._camera_target()
-        if knowledge == "nominal":
-            self._propagate(day, course, speed, None, (), None)
-        elif knowledge in ("bias", "berenguel"):
-            days_apart = plan.camera.bias_interval_days if knowledge == "bias" else plan.camera.berenguel_interval_days
-            since = workshop._last(day, days_apart)
-            looks = self._looks(since, _TURNS, target)
-            self._centred(day, course, speed, looks, since)
-        elif knowledge == "camera":
-            since = workshop._last(day, plan.camera.interval_days)
-            looks = self._looks(since, plan.camera.points_per_day, target)
-            free = PARAMETER_SETS["malan"] + (_WORMS if plan.camera.worm else ())
-            self._propagate(day, course, speed, looks, free, since)
-        elif knowledge == "drone":
-            since = workshop._last(day, plan.drone.interval_days)
-            looks = self._looks(since, plan.drone.points, self._field.target[:, :3])
-            free = (*PARAMETER_SETS["edwards-4"], "nonorthogonality_rad")
-            self._propagate(day, course, speed, looks, free, since)
-        else:
-            since = workshop._last(day, plan.radio_model.interval_days)
-            looks = self._looks(since, plan.radio_model.points_per_day, self._field.target[:, :3])
-            self._propagate(day, course, speed, looks, LEARNED, since)
-
-    def _centred(self, day: Day, course: _Course, speed: FloatArray, looks: _Course, since: int) -> None:
-        """As `_propagate` for both zeros from one look, each mirror at a time of its own; mean over these times."""
-        kept: dict[str, FloatArray] = self._square
-        total: dict[str, FloatArray] = {}
-        for i in range(looks.count.shape[1]):
-            self._square = {}
-            one = _Course(
-                sun_enu=looks.sun_enu[i : i + 1], heat=looks.heat[i : i + 1], normal_enu=looks.normal_enu[:, i : i + 1],
-                centre_enu_m=looks.centre_enu_m[:, i : i + 1], count=looks.count[:, i : i + 1].copy(),
-                rows=looks.rows[:, i : i + 1].copy(), seen=looks.seen[:, i : i + 1],
-            )  # fmt: skip
-            self._propagate(day, course, speed, one, _ZEROS, since)
-            for name, value in self._square.items():
-                total[name] = total.get(name, 0.0) + value / looks.count.shape[1]
-        self._square = kept
-        for name, value in total.items():
-            self._add(name, value)
+        calibration = self._calibration
+        if calibration is None:
+            return self._propagated(tracked, None)
+        since = calibration.last(tracked.day)
+        looks = self._plant.nominal_looks(since, calibration.n_look, calibration.instrument.target_enu_m)
+        if not calibration.corrections:
+            return self._propagated(tracked, _Looked(calibration=calibration, since_first=since, looks=looks))
+        # both zeros from one look, each mirror at a time of its own: the mean over these times
+        total: Squares = {}
+        for i in range(calibration.n_look):
+            one = _Looked(calibration=calibration, since_first=since, looks=looks.only(i))
+            for name, value in self._propagated(tracked, one).items():
+                total[name] = total.get(name, np.zeros(())) + value / calibration.n_look
         # taken off in whole steps
-        self._add("fit", (1.0 + course.axes[2] ** 2) * self._step**2 / 12.0)
+        one_axis, other = tracked.across
+        total["fit"] = total["fit"] + (other + one_axis**2) * self._plan.drive.step_rad**2 / 12.0
+        return total
 
-    def _propagate(
-        self, day: Day, course: _Course, speed: FloatArray, looks: _Course | None, free: tuple[str, ...],
-        since: int | None,
-    ) -> None:  # fmt: skip
-        """Add the error of each source while tracking, less what the fit makes of it."""
-        known = self._jacobian(course, free, direct=False) if free else None
-        gain = self._fit_gain(looks, free) if looks is not None else None
-        for source in self._sources(day, course, looks, since):
-            error = np.zeros((*course.count.shape[:2], 3)) if source.track is None else source.track
+    def _propagated(self, tracked: _Tracked, looked: _Looked | None) -> Squares:
+        """Return the error of each source while tracking, less what the calibration makes of it."""
+        found: Squares = {}
+        known = gain = None
+        if looked is not None:
+            known = self._jacobian(tracked.postures, looked.calibration.free)
+            gain = self._fit_gain(looked)
+        seen = tracked.postures.seen
+        for source in self._sources(tracked, looked):
+            error = np.zeros((*seen.shape, 3)) if source.track is None else source.track
             if gain is not None and known is not None and source.look is not None:
                 error = error - np.einsum("mtxf,mf->mtx", known, np.einsum("mfly,mly->mf", gain, source.look))
-            self._add(source.part, np.where(course.seen, np.sum(error**2, axis=-1), np.nan))
-        if gain is not None and looks is not None and known is not None:
-            self._add("fit", self._scatter(course, looks, known, gain))
+            square = np.where(seen, np.sum(error**2, axis=-1), np.nan)
+            found[source.part] = found.get(source.part, np.zeros(())) + square
+        if looked is not None and known is not None and gain is not None:
+            found["fit"] = self._scatter(looked, known, gain)
+        return found
 
-    def _direct(self) -> bool:
-        """Whether looks are at normals, not at spots."""
-        return self._method.knowledge in ("drone", "radio")
-
-    def _look_sigma(self, looks: _Course) -> FloatArray:
-        """(mirror, look, 2) scatter of an instrument's normals, right and up [rad]."""
-        knowledge = self._method.knowledge
-        if knowledge == "radio":
-            right, up, _ = self._radio_square(looks)
-            square = np.stack([right, up], axis=-1)[:, None]
-        elif knowledge == "drone":
-            sigma = drone_sigma_rad(
-                looks.centre_enu_m + self._plan.drone.distance_m * looks.sun_enu, looks.centre_enu_m,
-                target_enu_m=np.broadcast_to(self._field.target[:, None, :3], looks.centre_enu_m.shape),
-            )  # fmt: skip
-            square = np.repeat(sigma[..., None] ** 2, 2, axis=-1)
-        else:
-            square = np.repeat(self._camera_sigma(looks)[..., None] ** 2, 2, axis=-1)
-        return np.sqrt(np.broadcast_to(square, (*looks.count.shape[:2], 2)))
-
-    def _fit_gain(self, looks: _Course, free: tuple[str, ...]) -> FloatArray:
-        """(mirror, free, look, xyz): what the fit makes of a small turn of a look's normal."""
-        jacobian = self._jacobian(looks, free, direct=self._direct(), receiver=self._method.knowledge == "radio")
-        own = np.mean(self._look_sigma(looks) ** 2, axis=-1)
-        weight = np.where(looks.seen, 1.0 / (own + self._workshop._scatter_rad() ** 2), 0.0)
-        prior = np.diag([_PRIORS.get(name, _LARGE)[1] ** -2.0 for name in free])
+    def _fit_gain(self, looked: _Looked) -> FloatArray:
+        """(mirror, free, look, xyz): what the calibration makes of a small turn of a look's normal."""
+        calibration, looks = looked.calibration, looked.looks
+        free = calibration.free
+        jacobian = self._seen_jacobian(looked, free)
+        own = np.mean(calibration.instrument.variance_rad2(looks), axis=-1)
+        weight = np.where(looks.seen, 1.0 / (own + posture_scatter_rad(self._plant) ** 2), 0.0)
+        prior = np.diag([prior_sigma(name) ** -2.0 for name in free])
         prior = np.repeat(prior[None], len(jacobian), axis=0)
-        if self._method.knowledge in ("bias", "berenguel"):
+        if calibration.corrections:
             prior[:] = 1e-9 * np.eye(len(free))
-            prior[looks.axes[2][:, 0] <= _STEEP, 0, 0] = 1e18
+            prior[looks.cos_elevation[:, 0] <= STEEP, 0, 0] = 1e18
         weighted = jacobian * weight[..., None, None]
         normal = np.einsum("mlxf,mlxg->mfg", weighted, jacobian) + prior
         return np.asarray(np.linalg.solve(normal, np.moveaxis(weighted, 3, 1).reshape(*normal.shape[:2], -1))).reshape(
             *normal.shape[:2], *jacobian.shape[1:3]
         )
 
-    def _scatter(self, course: _Course, looks: _Course, known: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return what the scatter of single looks leaves by way of the fit."""
-        right, up, cosine = looks.axes
-        gusts = self._gusts
+    def _scatter(self, looked: _Looked, known: FloatArray, gain: FloatArray) -> FloatArray:
+        """Return what the scatter of single looks leaves by way of the calibration."""
+        looks, gusts = looked.looks, self._gusts
+        right, up = looks.right_up
+        cosine = looks.cos_elevation
         bent = gusts.bend**2 * (2.0 * gusts.mean_mps) ** 2 * self._gust_variance(False) + gusts.swing_sigma_rad**2
         slack = (1e-3 * np.array(self._plan.drive.backlash_mrad)) ** 2 / 12.0
-        square = self._look_sigma(looks) ** 2 + bent
+        square = looked.calibration.instrument.variance_rad2(looks) + bent
         square = square + np.stack([cosine**2 * slack[0], np.full_like(cosine, slack[1])], axis=-1)
-        total = np.zeros(course.count.shape[:2])
+        total = np.zeros(known.shape[:2])
         for direction, variance in ((right, square[..., 0]), (up, square[..., 1])):
             by_look = np.einsum("mflx,mlx->mfl", gain, direction) * np.sqrt(variance)[:, None]
             spread = np.einsum("mfl,mgl->mfg", by_look, by_look)
             total += np.einsum("mtxf,mfg,mtxg->mt", known, spread, known)
         return total
 
-    def _sources(self, day: Day, course: _Course, looks: _Course | None, since: int | None) -> list[_Source]:
+    def _sources(self, tracked: _Tracked, looked: _Looked | None) -> list[_Source]:
         """Return all that makes mirrors point elsewhere than the model has it."""
-        found = self._mount_sources(day, course, looks, since)
-        right, up, _ = course.axes
+        found = self._mount_sources(tracked, looked)
         steady = self._gusts.mean_mps**2 * self._gusts.bend
-        at_look = None if looks is None else looks.axes
-        for a, direction in enumerate((right, up)):
+        at_look = None if looked is None else looked.looks.right_up
+        for a, direction in enumerate(tracked.postures.right_up):
             seen = None if at_look is None else steady[a] * at_look[a]
             found.append(_Source("steady_wind", seen, steady[a] * direction))
-        if at_look is None or looks is None:
+        if looked is None or at_look is None:
             return found
-        for a, square in enumerate(self._constant_square().T):
+        instrument = looked.calibration.instrument
+        for a, square in enumerate(instrument.constant_variance_rad2().T):
             found.append(_Source("instrument", np.sqrt(square)[:, None, None] * at_look[a], None))
-        if self._method.knowledge == "radio":
-            found.append(_Source("plate_drift", self._plate_drift(looks)[None, :, None] * at_look[0], None))
+        if isinstance(instrument, RadioPoses):
+            drift = instrument.drift_sigma_rad(looked.looks.heat)
+            found.append(_Source("plate_drift", drift[None, :, None] * at_look[0], None))
         return found
 
-    def _constant_square(self) -> FloatArray:
-        """(mirror, 2) variance of the instrument's constant error."""
-        knowledge, plan = self._method.knowledge, self._plan
-        if knowledge == "radio":
-            return self._plate_square()
-        sigma = plan.drone.constant_sigma_mrad if knowledge == "drone" else plan.camera.scale_error_sigma_mrad
-        return np.full((len(self._field), 2), (1e-3 * sigma) ** 2)
-
-    def _mount_sources(self, day: Day, course: _Course, looks: _Course | None, since: int | None) -> list[_Source]:
-        sigma = self._sigmas()
-        names = tuple(sigma)
-        track = self._jacobian(course, names, direct=False)
-        seen = None
-        if looks is not None:
-            seen = self._jacobian(looks, names, direct=self._direct(), receiver=self._method.knowledge == "radio")
+    def _mount_sources(self, tracked: _Tracked, looked: _Looked | None) -> list[_Source]:
+        names = tuple(self._sigma)
+        track = self._jacobian(tracked.postures, names)
+        seen = None if looked is None else self._seen_jacobian(looked, names)
         found = []
-        for i, name in enumerate(names):
-            part = "place" if name in _PLACE else "worm" if name in _WORMS else "mount"
-            found.append(
-                _Source(part, None if seen is None else sigma[name] * seen[..., i], sigma[name] * track[..., i])
-            )
+        for i, (name, sigma) in enumerate(self._sigma.items()):
+            part = "place" if name in PLACE else "worm" if name in WORMS else "mount"
+            found.append(_Source(part, None if seen is None else sigma * seen[..., i], sigma * track[..., i]))
         e = self._plan.mount_errors
-        lean, creep = 1e-3 * e.thermal_sigma_mrad, 1e-3 * e.creep_sigma_mrad_per_month / _MONTH_DAYS
-        for i in (names.index("pedestal_tilt_north_rad"), names.index("pedestal_tilt_east_rad")):
-            by_day = None if seen is None or looks is None else lean * looks.heat[None, :, None] * seen[..., i]
-            found.append(_Source("heat", by_day, lean * course.heat[None, :, None] * track[..., i]))
-            grown = None if seen is None or since is None else creep * since * seen[..., i]
-            found.append(_Source("creep", grown, creep * day.since_first * track[..., i]))
+        lean, creep = 1e-3 * e.thermal_sigma_mrad, 1e-3 * e.creep_sigma_mrad_per_month / MONTH_DAYS
+        for i in (names.index(name) for name in _TILTS):
+            warm = tracked.postures.heat[None, :, None]
+            by_day = grown = None
+            if seen is not None and looked is not None:
+                by_day = lean * looked.looks.heat[None, :, None] * seen[..., i]
+                grown = creep * looked.since_first * seen[..., i]
+            found.append(_Source("heat", by_day, lean * warm * track[..., i]))
+            found.append(_Source("creep", grown, creep * tracked.day.since_first * track[..., i]))
         return found
 
     # -- light -----------------------------------------------------------------------------------------------
 
     def _offered_kwh(self) -> tuple[float, float]:
         """Return the light on a square metre of mirror, over the scenario's days and over a year."""
-        towards = None if self._dish else self._field.target[:, :3] - self._field.pivot_enu_m
-        low = float(np.deg2rad(self._plan.min_sun_elevation_deg))
+        site, mirrors = site_of(self._scenario), self._field
+        towards = None if mirrors.is_dish else mirrors.target[:, :3] - mirrors.pivot_enu_m
         stride = max(1, round(60.0 / self._plan.servo_interval_s))
         total = 0.0
-        for day in self._every:
+        for day in self._plant.days:
             at = np.flatnonzero(day.works)[::stride]
             found = energy(
-                self._site, day.unix_s[at], target_enu=towards, beam_w_m2=day.power_w_per_m2[at], min_elevation_rad=0.0
+                site, day.unix_s[at], target_enu=towards, beam_w_m2=day.power_w_per_m2[at], min_elevation_rad=0.0
             )
             total += float(np.mean(found.offered_j_m2))
-        times = representative_days(self._site, self._plan.date.year, 12)
-        year = energy(self._site, times, target_enu=towards, min_elevation_rad=low)
+        times = representative_days(site, self._plan.date.year, 12)
+        low = float(np.deg2rad(self._plan.min_sun_elevation_deg))
+        year = energy(site, times, target_enu=towards, min_elevation_rad=low)
         return total / 3.6e6, float(np.mean(year.offered_j_m2)) * 365.25 / 12.0 / 3.6e6
 
 
-def _mean_known(values: list[FloatArray]) -> FloatArray:
-    """Return the mean over the first axis of what is no NaN; nothing known: zero."""
-    known = np.isfinite(values)
-    return np.asarray(np.sum(np.nan_to_num(values), axis=0) / np.maximum(known.sum(axis=0), 1))
+def _hunting(left: FloatArray) -> FloatArray:
+    """Return the square of what is left of teeth that feedback cannot take away, though it sees them.
 
-
-def _part_of(whole: Field, some: npt.NDArray[np.int64]) -> Field:
-    """Return some mirrors of a field."""
-    rows = {f.name: getattr(whole, f.name)[some] for f in dataclasses.fields(whole) if f.name != "ids"}
-    return Field(ids=tuple(whole.ids[i] for i in some), **rows)
+    It goes to and fro between two steps, the mean being right: φ(1 − φ) of a step squared, on the average over φ
+    twice the tooth's own 1/12. Teeth too quick for it pass as they are.
+    """
+    return np.asarray(left + 2.0 * np.maximum(1.0 - left, 0.0))

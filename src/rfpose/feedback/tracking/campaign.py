@@ -15,18 +15,18 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels as mount_kernels
+from rfpose.feedback.columns import P
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Event, Mode
 from rfpose.feedback.optics import reflect, target_offset_m
 from rfpose.feedback.tracking import _kernels
-from rfpose.feedback.tracking.hidden import Field, generator
-from rfpose.feedback.tracking.instruments import correct_zeros
+from rfpose.feedback.tracking.calibrations import correct_zeros
+from rfpose.feedback.tracking.hidden import TILTS, Field, generator
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.scenario import Scenario
 
 __all__ = ["Campaign"]
 
-_PLATE_UP, _PLATE_RIGHT = 29, 30
 _LONGEST_S = 3600.0
 
 
@@ -145,7 +145,7 @@ class Campaign:
     def _posture(self, i: int, s: int, day: Day, state: FloatArray, true: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return a mirror's normal and centre as they are; wind and swing average out over a look."""
         p = true[i : i + 1].copy()
-        p[:, :2] += self._field.lean_rad[i] * day.heat[s]
+        p[:, TILTS] += self._field.lean_rad[i] * day.heat[s]
         count = np.ascontiguousarray(state[i : i + 1, None, _kernels.AXIS : _kernels.AXIS + 2])
         out = mount_kernels.posture_batch(p, self._field.constant[i : i + 1], count, 0.0)[0, 0]
         return out[2:5], out[5:8]
@@ -217,8 +217,8 @@ class Campaign:
         is_now = geometry.unit(sun + geometry.unit(beam + moved / distance))
         if self._feedback == _kernels.RADIO:
             mirror = geometry.rot_enu_from_mirror(is_now)
-            model[i, _PLATE_RIGHT] += (wanted - is_now) @ mirror[:, 0]
-            model[i, _PLATE_UP] += (wanted - is_now) @ mirror[:, 1]
+            model[i, P.receiver_plane_right_rad] += (wanted - is_now) @ mirror[:, 0]
+            model[i, P.receiver_plane_up_rad] += (wanted - is_now) @ mirror[:, 1]
         else:
             correct_zeros(model[i : i + 1], wanted[None], is_now[None])
 

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, check_names
+from rfpose.feedback.columns import P, columns_of, constant
+from rfpose.feedback.mount import Actuator, Mount, check_names
 from rfpose.scenario import Scenario
 
-__all__ = ["Field", "azimuth_course_rad", "draw_field", "field_positions", "generator"]
+__all__ = [
+    "MONTH_DAYS",
+    "PLACE",
+    "TILTS",
+    "WORMS",
+    "ZEROS",
+    "Field",
+    "azimuth_course_rad",
+    "draw_field",
+    "field_positions",
+    "generator",
+    "sigma_as_built",
+]
 
-_INDEX = {name: i for i, name in enumerate(PARAMETERS)}
-_MONTH_DAYS = 30.4375
+MONTH_DAYS = 30.4375
+PLACE = ("location_east_m", "location_north_m", "location_up_m")
+WORMS = ("worm_1_sin_rad", "worm_1_cos_rad", "worm_2_sin_rad", "worm_2_cos_rad")
+TILTS = columns_of(("pedestal_tilt_north_rad", "pedestal_tilt_east_rad"))
+ZEROS = columns_of(("axis_1_zero_rad", "axis_2_zero_rad"))
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -27,9 +45,9 @@ class Field:
     ----------
     ids, pivot_enu_m
         Names and nominal pivots [m].
-    nominal, constant : (mirror, 31), (mirror, 26)
+    nominal, constant : (mirror, parameter), (mirror, constant)
         Mount as planned, as the kernels read it.
-    true : (mirror, 31)
+    true : (mirror, parameter)
         Mount as built, at the run's first day; the receivers' plane included.
     lean_rad : (mirror, 2)
         Amplitude of the pedestal's daily lean, towards north and east [rad].
@@ -59,10 +77,20 @@ class Field:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def is_dish(self) -> bool:
+        """Whether the mirrors look at the sun."""
+        return bool(self.target[0, 3])
+
+    def some(self, rows: npt.NDArray[np.int64]) -> Field:
+        """Return some of the mirrors."""
+        values = {f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self) if f.name != "ids"}
+        return Field(ids=tuple(self.ids[i] for i in rows), **values)
+
     def at(self, day: float) -> FloatArray:
-        """Return the true mounts so many days after the first (mirror, 31)."""
+        """Return the true mounts so many days after the first (mirror, parameter)."""
         p = self.true.copy()
-        p[:, :2] += self.creep_rad_per_day * day
+        p[:, TILTS] += self.creep_rad_per_day * day
         return p
 
 
@@ -113,13 +141,13 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: Flo
     is_dish = plan.collector == "dish"
     if scenario.site.aim_enu_m is None and not is_dish:
         raise ScenarioError("[site] `aim_enu_m` is missing: the mirrors have nothing to face; add it")
-    nominal, constant = _nominal(scenario, ids, pivot, azimuth_course_rad(scenario, pivot, sun_enu)[1])
+    nominal, constants = _nominal(scenario, ids, pivot, azimuth_course_rad(scenario, pivot, sun_enu)[1])
     true = _true(scenario, nominal, rng)
     lean = 1e-3 * rng.standard_normal((n, 2))
     e = plan.mount_errors
     plate = 1e-3 * plan.radio.plate_sigma_mrad * rng.standard_normal((n, 2))
-    true[:, _INDEX["receiver_plane_up_rad"]] = plate[:, 0]
-    true[:, _INDEX["receiver_plane_right_rad"]] = plate[:, 1]
+    true[:, P.receiver_plane_up_rad] = plate[:, 0]
+    true[:, P.receiver_plane_right_rad] = plate[:, 1]
     target = np.zeros((n, 4))
     target[:, 3] = float(is_dish)
     if not is_dish:
@@ -128,10 +156,10 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: Flo
         ids=ids,
         pivot_enu_m=pivot,
         nominal=nominal,
-        constant=constant,
+        constant=constants,
         true=true,
         lean_rad=e.thermal_sigma_mrad * lean,
-        creep_rad_per_day=e.creep_sigma_mrad_per_month / _MONTH_DAYS * 1e-3 * rng.standard_normal((n, 2)),
+        creep_rad_per_day=e.creep_sigma_mrad_per_month / MONTH_DAYS * 1e-3 * rng.standard_normal((n, 2)),
         plate_drift_rad=1e-3 * plan.radio.plate_drift_mrad * rng.standard_normal(n),
         camera_bias_rad=1e-3 * plan.camera.scale_error_sigma_mrad * rng.standard_normal((n, 2)),
         drone_bias_rad=1e-3 * plan.drone.constant_sigma_mrad * rng.standard_normal((n, 2)),
@@ -177,37 +205,33 @@ def _nominal(
     k = np.repeat(like.constant_vector()[None], len(pivot), axis=0)
     arms = {h.id: h.arm_m for h in scenario.heliostat}
     usual = next(iter(arms.values()), 0.0)
-    p[:, _INDEX["arm_normal_m"]] = [arms.get(name, usual) for name in ids]
-    k[:, 15] = home_rad
-    k[:, 19:22] = pivot
+    p[:, P.arm_normal_m] = [arms.get(name, usual) for name in ids]
+    constant(k, "angle_at_zero_rad")[:, 0] = home_rad
+    constant(k, "pivot_enu_m")[:] = pivot
     return p, k
+
+
+def sigma_as_built(scenario: Scenario) -> dict[str, float]:
+    """Return the standard deviations of mounts' parameters over a field, by name [rad, m]."""
+    e = scenario.tracking.mount_errors
+    return {
+        **dict.fromkeys(("pedestal_tilt_north_rad", "pedestal_tilt_east_rad"), 1e-3 * e.tilt_sigma_mrad),
+        **dict.fromkeys(("axis_1_zero_rad", "axis_2_zero_rad"), 1e-3 * e.zero_sigma_mrad),
+        "nonorthogonality_rad": 1e-3 * e.nonorthogonality_sigma_mrad,
+        **dict.fromkeys(("canting_up_rad", "canting_right_rad"), 1e-3 * e.canting_sigma_mrad),
+        **dict.fromkeys(PLACE, 1e-3 * e.location_sigma_mm),
+        **dict.fromkeys(WORMS, 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0)),
+        "gravity_sag_rad": 1e-3 * e.sag_sigma_mrad,
+    }
 
 
 def _true(scenario: Scenario, nominal: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Draw mounts as built."""
-    e = scenario.tracking.mount_errors
-    fixed = e.fixed
+    fixed = scenario.tracking.mount_errors.fixed
     check_names(fixed)
-    sigma = {
-        "pedestal_tilt_north_rad": 1e-3 * e.tilt_sigma_mrad,
-        "pedestal_tilt_east_rad": 1e-3 * e.tilt_sigma_mrad,
-        "axis_1_zero_rad": 1e-3 * e.zero_sigma_mrad,
-        "axis_2_zero_rad": 1e-3 * e.zero_sigma_mrad,
-        "nonorthogonality_rad": 1e-3 * e.nonorthogonality_sigma_mrad,
-        "canting_up_rad": 1e-3 * e.canting_sigma_mrad,
-        "canting_right_rad": 1e-3 * e.canting_sigma_mrad,
-        "location_east_m": 1e-3 * e.location_sigma_mm,
-        "location_north_m": 1e-3 * e.location_sigma_mm,
-        "location_up_m": 1e-3 * e.location_sigma_mm,
-        "worm_1_sin_rad": 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0),
-        "worm_1_cos_rad": 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0),
-        "worm_2_sin_rad": 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0),
-        "worm_2_cos_rad": 1e-3 * e.worm_sigma_mrad / np.sqrt(2.0),
-        "gravity_sag_rad": 1e-3 * e.sag_sigma_mrad,
-    }
     true = nominal.copy()
-    for name, spread in sigma.items():
-        true[:, _INDEX[name]] += spread * rng.standard_normal(len(true))
+    for name, spread in sigma_as_built(scenario).items():
+        true[:, getattr(P, name)] += spread * rng.standard_normal(len(true))
     for name, value in fixed.items():
-        true[:, _INDEX[name]] = value
+        true[:, getattr(P, name)] = value
     return true

@@ -10,17 +10,17 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
+from rfpose.feedback.tracking.calibrations import Calibrator
+from rfpose.feedback.tracking.engine import Draws, Engine, always_track, empty_courses, empty_tally
 from rfpose.feedback.tracking.hidden import generator
-from rfpose.feedback.tracking.instruments import Workshop
-from rfpose.feedback.tracking.loops import check_gains, drive_numbers
+from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS
-from rfpose.feedback.tracking.operation import Told
+from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.radio import RadioErrors, RadioModel
-from rfpose.feedback.tracking.run import MethodRun
-from rfpose.feedback.tracking.simulation import Simulation
 from rfpose.scenario import Scenario
 
 __all__ = ["MOST_MIRRORS", "LiveField", "Moment", "live_scenario"]
@@ -139,29 +139,27 @@ class LiveField:
     """
 
     def __init__(self, scenario: Scenario, *, seed: int = 0, start_hour: float = 10.0) -> None:
-        count = min(MOST_MIRRORS, len(scenario.heliostat)) or None
         check_gains(scenario)
-        self._plan = Simulation(scenario, methods=("open-loop",), count=count, seed=seed)
-        self._run = MethodRun(METHODS["radio"], self._plan.world)
-        self.field, self._day = self._plan.field, self._plan.days[0]
-        self._scenario, self._seed = scenario, int(seed)
+        self._plant = plant = Plant(scenario, count=min(MOST_MIRRORS, len(scenario.heliostat)), seed=int(seed))
+        plant.check_reach()
+        self.field, self._day = plant.field, plant.days[0]
+        self._engine = Engine(METHODS["radio"], plant)
+        self._scenario = scenario
         self._servo_s = scenario.tracking.servo_interval_s
-        self._interval = self._run.loop.interval
+        self._interval = self._engine.loop.interval
         late = int(np.searchsorted(self._day.hour, start_hour))
         last = len(self._day.unix_s) - self._interval
         self._at = max(min(late, last) // self._interval * self._interval, 0)
-        noon = int(np.argmax(self._day.sun_enu[: len(self._day.unix_s), 2]))
-        self._radio = _Radio(scenario, self.field.pivot_enu_m, usual_normal_enu=self._wanted_enu(noon))
-        workshop = Workshop(scenario, self.field, self._radio, self._plan.gusts, seed=seed)
-        self._run.model[:] = workshop.model(METHODS["radio"], self._day)
-        self._gust_state = self._plan.gusts.process.start(generator(seed, 11, 0), len(self.field))
+        self._radio = _Radio(scenario, self.field.pivot_enu_m, usual_normal_enu=plant.usual_normal_enu())
+        self._engine.model[:] = Calibrator(plant, self._radio).model(METHODS["radio"], self._day)
+        self._gust_state = plant.gusts.process.start(generator(plant.seed, 11, 0), len(self.field))
         self._gusts: list[tuple[float, float, float]] = []
         self._stopped = np.zeros(len(self.field), np.bool_)
         self._renew = np.zeros(len(self.field), np.bool_)
         self._control: FieldControl | None = None
         self._radio_due = self._at
         self._radio_errors = self._measure()
-        self._run.state[:, _kernels.NEXT] = self._nearest_count()
+        self._engine.rest(self._nearest_count())
 
     # -- what it is ----------------------------------------------------------------------------------------
 
@@ -220,7 +218,7 @@ class LiveField:
                 pivot_enu_m=self.field.pivot_enu_m,
                 mode=Mode.TRACK,
                 start_s=self._at * self._servo_s,
-                rng=generator(self._seed, 12, self._at),
+                rng=generator(self._plant.seed, 12, self._at),
             )
             self._control.emergency()
 
@@ -233,7 +231,7 @@ class LiveField:
         if self._control is not None:
             self._control = None
             self._renew[:] = True
-            self._run.ring[:] = 0.0
+            self._engine.ring[:] = 0.0
 
     # -- going on ------------------------------------------------------------------------------------------
 
@@ -260,7 +258,7 @@ class LiveField:
             normal_enu=read_only(normal),
             error_rad=read_only(error),
             radio_sigma_rad=read_only(sigma),
-            wind_mps=float(self._plan.gusts.mean_mps + extra[-1]),
+            wind_mps=float(self._plant.gusts.mean_mps + extra[-1]),
             mode=mode,
             stopped=self._stopped.copy(),
             dead=self._radio.dead.copy(),
@@ -268,16 +266,15 @@ class LiveField:
 
     def _measure(self) -> RadioErrors:
         self._radio_due = self._at + round(_RADIO_EVERY_S / self._servo_s)
-        return self._radio.errors(self._wanted_enu(self._at), generator(self._seed, 13, self._at))
-
-    def _wanted_enu(self, i_step: int) -> FloatArray:
-        return self._plan.wanted_normal_enu(self._day, i_step)
+        wanted = self._plant.wanted_normal_enu(self._day, self._at)
+        return self._radio.errors(wanted, generator(self._plant.seed, 13, self._at))
 
     def _nearest_count(self) -> FloatArray:
         """Azimuth motors' counts towards the first wanted normals, nearest to the middle of their travel."""
-        azimuth = geometry.azimuth_elevation_from_enu(self._wanted_enu(self._at))[0]
-        way = np.mod(azimuth - self.field.constant[:, 15] + np.pi, 2.0 * np.pi) - np.pi
-        return np.asarray(way * self.field.constant[:, 13])
+        azimuth = geometry.azimuth_elevation_from_enu(self._plant.wanted_normal_enu(self._day, self._at))[0]
+        home, per_rad = (constant(self.field.constant, name)[:, 0] for name in ("angle_at_zero_rad", "counts_per_unit"))
+        way = np.mod(azimuth - home + np.pi, 2.0 * np.pi) - np.pi
+        return np.asarray(way * per_rad)
 
     def _gust_mps(self, unix_s: FloatArray) -> FloatArray:
         """(step,) what the gusts under way add to the wind; those that have passed are forgotten."""
@@ -290,65 +287,57 @@ class LiveField:
 
     def _go(self, steps: slice, extra_mps: FloatArray) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int8]]:
         """Take all mirrors through a step; true normals, errors and modes at its end."""
-        n, plan = len(self.field), self._scenario.tracking
-        mean = max(self._plan.gusts.mean_mps, _LEAST_WIND_MPS)
-        wind = self._plan.gusts.run(
-            self._gust_state, generator(self._seed, 14, self._at), self._day.unix_s[steps]
-        ).astype(np.float64)
-        # the kernel's push is V² + 2 V g: what makes it the square of the speed with the gust
-        gust = (wind + ((mean + wind) * extra_mps + 0.5 * extra_mps**2) / mean).astype(np.float32)
-        rng = generator(self._seed, 15, self._at)
-        noise = rng.standard_normal((n, 1, 2), dtype=np.float32)
-        lost = (rng.random((n, 1), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
-        lost[~self._radio_errors.solved] = 1
-        told = Told.always_track(self.field)
-        told.renew[:] = self._renew
+        n, engine = len(self.field), self._engine
+        courses = empty_courses(n, np.arange(n), self._interval, 1)
+        stretch = engine.stretch(self._day, steps, self._draw(steps, extra_mps), empty_tally(n, 0), courses)
+        tasks = always_track(self._plant)
+        tasks.renew[:] = self._renew
         self._renew[:] = False
         modes = np.full(n, Mode.TRACK, np.int8)
-        error, trace = np.full((n, self._interval), np.nan), np.full((n, self._interval, 8), np.nan)
         # in an emergency field control has its say each second
         each = self._interval if self._control is None else 1
         for first in range(0, self._interval, each):
             if self._control is not None:
-                modes = self._obey(self._control, steps.start + first, told)
-            told.duty[self._stopped] = _kernels.GO
-            told.goal[self._stopped] = self._run.state[self._stopped, _kernels.MOTOR : _kernels.MOTOR + 2]
-            self._advance(told, steps, (first, first + each), mean, gust, noise, lost, error, trace)
-        return trace[:, -1, :3], error[:, -1], modes
+                modes = self._obey(self._control, steps.start + first, tasks)
+            tasks.duty[self._stopped] = _kernels.GO
+            tasks.goal[self._stopped] = engine.state[self._stopped, _kernels.MOTOR : _kernels.MOTOR + 2]
+            engine.go(stretch, tasks, first, first + each)
+        return courses.trace[:, -1, :3], courses.error[:, -1], modes
 
-    def _advance(
-        self, told: Told, steps: slice, span: tuple[int, int], mean_mps: float,
-        gust: npt.NDArray[np.float32], noise: npt.NDArray[np.float32], lost: npt.NDArray[np.uint8],
-        error: FloatArray, trace: FloatArray,
-    ) -> None:  # fmt: skip
-        """Call the kernel for a part of the interval; errors and courses go into ``error`` and ``trace``."""
-        run, field, day, n_step, n = self._run, self.field, self._day, self._interval, len(self.field)
-        n_free = run.cov.shape[1]
-        rng = generator(self._seed, 16, steps.start)
-        _kernels.advance_some(
-            0, n, run.loop, run.law, *(drive_numbers(self._scenario, axis) for axis in (0, 1)), self._plan.world.table,
-            steps.start, *span, told.duty, told.renew, told.scored, told.mode, told.aim, told.goal, told.heard,
-            told.age, field.at(0.0), field.constant, field.lean_rad, day.heat[steps].copy(), run.model,
-            np.zeros((n, n_free, n_free)), np.zeros(n_free, np.int64), np.zeros(n_free), np.zeros(n_free),
-            day.sun_enu[steps.start : steps.stop + n_step + 1].copy(), field.target, gust, mean_mps,
-            self._plan.gusts.bend, self._plan.gusts.draw_swing(rng, (n, n_step)), noise,
-            self._radio_errors.spread_rad, self._radio_errors.bias_rad, lost, np.zeros((n, n_step), np.uint8),
-            day.power_w_per_m2[steps].copy(), field.plate_drift_rad, field.sensor_bias_rad,
-            run.state, run.ring, run.total[0], run.by_mode[0], run.by_outage, run.hours,
-            day.hour[steps].astype(np.int64), run.histogram, 1, error, np.zeros((n, n_step, 2)), np.arange(n),
-            trace, run.light,
-        )  # fmt: skip
+    def _draw(self, steps: slice, extra_mps: FloatArray) -> Draws:
+        """Draw wind and radio frames of a step."""
+        n, plant, n_step = len(self.field), self._plant, self._interval
+        mean = max(plant.gusts.mean_mps, _LEAST_WIND_MPS)
+        wind = plant.gusts.run(self._gust_state, generator(plant.seed, 14, self._at), self._day.unix_s[steps]).astype(
+            np.float64
+        )
+        rng = generator(plant.seed, 15, self._at)
+        noise = rng.standard_normal((n, 1, 2), dtype=np.float32)
+        lost = (rng.random((n, 1), dtype=np.float32) < self._scenario.tracking.radio.lost_frames).astype(np.uint8)
+        lost[~self._radio_errors.solved] = 1
+        return Draws(
+            mean_mps=mean,
+            # the kernel's push is V² + 2 V g: what makes it the square of the speed with the gust
+            gust=(wind + ((mean + wind) * extra_mps + 0.5 * extra_mps**2) / mean).astype(np.float32),
+            swing=plant.gusts.draw_swing(generator(plant.seed, 16, self._at), (n, n_step)),
+            noise=noise,
+            lost=lost,
+            outage=np.zeros((n, n_step), np.uint8),
+            spread=self._radio_errors.spread_rad,
+            bias=self._radio_errors.bias_rad,
+        )
 
-    def _obey(self, control: FieldControl, i_step: int, told: Told) -> npt.NDArray[np.int8]:
+    def _obey(self, control: FieldControl, i_step: int, tasks: _kernels.Tasks) -> npt.NDArray[np.int8]:
         """Let field control say where the axes go; return the modes."""
-        home, per_rad = self.field.constant[:, 15:17].copy(), self.field.constant[:, 13:15]
+        home = constant(self.field.constant, "angle_at_zero_rad").copy()
+        per_rad = constant(self.field.constant, "counts_per_unit")
         home[:, 0] -= 2.0 * np.pi * np.rint(home[:, 0] / (2.0 * np.pi))
-        axis = home + self._run.state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / per_rad
+        axis = home + self._engine.state[:, _kernels.MOTOR : _kernels.MOTOR + 2] / per_rad
         orders = control.step(
             i_step * self._servo_s, axis_rad=axis, aim_axis_rad=axis, sun_enu=self._day.sun_enu[i_step],
-            wind_m_s=_CALM_MPS,
+            wind_mps=_CALM_MPS,
         )  # fmt: skip
         goes = np.asarray(np.isfinite(orders.target_axis_rad).all(axis=1))
-        told.duty[:] = np.where(goes, _kernels.GO, _kernels.TRACK)
-        told.goal[:] = np.where(goes[:, None], (orders.target_axis_rad - home) * per_rad, 0.0)
+        tasks.duty[:] = np.where(goes, _kernels.GO, _kernels.TRACK)
+        tasks.goal[:] = np.where(goes[:, None], (orders.target_axis_rad - home) * per_rad, 0.0)
         return orders.mode

@@ -2,62 +2,65 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.servo import PiLaw, Stepper
-from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers
+from rfpose.feedback.servo import Stepper
+from rfpose.feedback.servo._kernels import DriveNumbers
 from rfpose.feedback.servo.margins import LEAST_GAIN_MARGIN, Margins, margins
 from rfpose.feedback.servo.rules import EARTH_RADPS
 from rfpose.feedback.structure import Structure
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD
 from rfpose.feedback.tracking.methods import Method
+from rfpose.feedback.tracking.sampled_loop import SampledLoop
 from rfpose.feedback.tracking.timeline import site_of
-from rfpose.feedback.tracking.wind import Gusts
+from rfpose.feedback.tracking.wind import Gusts, structure_of
 from rfpose.scenario import Scenario
 
-__all__ = ["check_gains", "drive_numbers", "loop_margins", "loop_margins_of", "loop_numbers"]
+__all__ = ["check_gains", "drive_numbers", "loop_margins", "loop_margins_of", "loop_of", "steering_of"]
 
 _FORGET_OFFSET_S = 300.0
 
 
-def loop_margins(
-    gain_per_s: float,
-    integral_per_s2: float,
-    *,
-    interval_s: float,
-    latency_s: float,
-    structure: Structure | None = None,
-) -> Margins:
-    """Return the margins of ``velocity = gain e + integral ∫e`` on a motor that goes at once where it is told.
+def loop_of(scenario: Scenario, feedback: int) -> SampledLoop | None:
+    """Return the loop of a kind of feedback, by the kernels' number; None: nothing is measured."""
+    plan, servo = scenario.tracking, scenario.tracking.servo_interval_s
+    if feedback == _kernels.RADIO:
+        return SampledLoop(
+            gain_per_s=plan.radio.gain_per_s, integral_gain_per_s2=plan.radio.integral_gain_per_s2,
+            interval_s=plan.control_interval_s, latency_s=plan.radio.latency_s, servo_s=servo,
+            lost=plan.radio.lost_frames,
+        )  # fmt: skip
+    # what is seen in a step acts in the next
+    if feedback == _kernels.ENCODER:
+        return SampledLoop(gain_per_s=plan.encoder.gain_per_s, interval_s=servo, latency_s=servo, servo_s=servo)
+    if feedback == _kernels.SUN_SENSOR:
+        return SampledLoop(
+            gain_per_s=plan.sun_sensor.gain_per_s, integral_gain_per_s2=plan.sun_sensor.integral_gain_per_s2,
+            interval_s=servo, latency_s=servo, servo_s=servo,
+        )  # fmt: skip
+    return None
+
+
+def loop_margins(loop: SampledLoop, structure: Structure | None = None) -> Margins:
+    """Return the margins of a loop on a motor that goes at once where it is told.
 
     At the next tick a measurement has acted in full if the latency is less than the interval: what counts is the
     number of whole intervals beyond. ``structure`` lies between motor and mirror; None: stiff.
-
-    Raises
-    ------
-    InvalidInputError
-        Gains that are no law, an interval that is not positive, a latency that is negative.
     """
-    beyond = max(int(np.ceil(latency_s / interval_s - 1e-9)) - 1, 0)
-    law = PiLaw(gain_per_s=gain_per_s, integral_gain_per_s2=integral_per_s2, levels=0)
-    return margins(law, structure, interval_s=interval_s, latency_s=beyond * interval_s)
+    return margins(loop.law, structure, interval_s=loop.interval_s, latency_s=loop.delay_s)
 
 
 def loop_margins_of(scenario: Scenario) -> Margins:
     """Return the margins of the scenario's radio loop."""
-    plan = scenario.tracking
-    mode = plan.structure
-    return loop_margins(
-        plan.radio.gain_per_s,
-        plan.radio.integral_gain_per_s2,
-        interval_s=plan.control_interval_s,
-        latency_s=plan.radio.latency_s,
-        structure=Structure(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None,
-    )
+    loop = loop_of(scenario, _kernels.RADIO)
+    assert loop is not None
+    return loop_margins(loop, structure_of(scenario))
 
 
 def check_gains(scenario: Scenario) -> Margins:
@@ -79,57 +82,47 @@ def check_gains(scenario: Scenario) -> Margins:
     return found
 
 
-def loop_numbers(scenario: Scenario, method: Method, gusts: Gusts) -> tuple[_kernels.Loop, LawNumbers]:
-    """Return how a method steers, as the kernels read it.
+def steering_of(scenario: Scenario, method: Method, gusts: Gusts, table: FloatArray) -> _kernels.Steering:
+    """Return how a method steers, as the kernels read it; ``table`` of `capture_table`.
 
     Raises
     ------
     InvalidInputError
         Radio that is later than the kernels keep measurements for.
     """
-    plan = scenario.tracking
-    radio, servo = plan.radio, plan.servo_interval_s
+    plan, servo = scenario.tracking, scenario.tracking.servo_interval_s
     control = round(plan.control_interval_s / servo)
-    interval, latency, gain, integral, level = control, 1, 1.0, 0.0, 1.0  # what is seen in a step acts in the next
-    if method.feedback == _kernels.RADIO:
-        gain, integral = radio.gain_per_s, radio.integral_gain_per_s2
-        latency = max(int(np.ceil(radio.latency_s / servo - 1e-9)), 1)
-        if latency > (_kernels.N_RING - 1) * interval:
-            raise InvalidInputError(
-                f"[tracking.radio] `latency_s` {radio.latency_s:g} is more than {_kernels.N_RING - 1} control "
-                "intervals; shorten it or lengthen `control_interval_s`"
-            )
-    elif method.feedback == _kernels.ENCODER:
-        interval, gain, level = 1, plan.encoder.gain_per_s, 2.0 * np.pi / 2**plan.encoder.bits
-    elif method.feedback == _kernels.SUN_SENSOR:
-        sensor = plan.sun_sensor
-        interval, gain, integral = 1, sensor.gain_per_s, sensor.integral_gain_per_s2
-        level = 2e-3 * sensor.range_mrad / sensor.levels
+    sampled = loop_of(scenario, method.feedback) or SampledLoop(
+        gain_per_s=1.0, interval_s=plan.control_interval_s, latency_s=servo, servo_s=servo
+    )
+    interval = sampled.interval
+    if method.feedback == _kernels.RADIO and sampled.latency > (_kernels.N_RING - 1) * interval:
+        raise InvalidInputError(
+            f"[tracking.radio] `latency_s` {plan.radio.latency_s:g} is more than {_kernels.N_RING - 1} control "
+            "intervals; shorten it or lengthen `control_interval_s`"
+        )
+    levels = {_kernels.ENCODER: plan.encoder.level_rad, _kernels.SUN_SENSOR: plan.sun_sensor.level_rad}
     seconds = interval * servo
     learn = max(1, round(plan.radio_model.learn_interval_s / plan.control_interval_s)) if method.learns else 0
-    law = PiLaw(
-        gain_per_s=gain,
-        integral_gain_per_s2=integral,
-        speed_radps=1e-3 * plan.drive.speed_mradps,
-        levels=0,
-    ).numbers()
+    law = replace(sampled.law, speed_radps=1e-3 * plan.drive.speed_mradps).numbers()
     loop = _kernels.Loop(
         feedback=method.feedback,
         interval=interval,
-        latency=latency,
+        latency=sampled.latency,
         leak=float(np.exp(-seconds / _FORGET_OFFSET_S)) if method.learns else 1.0,
         learn=learn,
         wind_variance=gusts.variance_rad2,
         settle=round(plan.settle_s / servo),
         servo_s=servo,
-        level=level,
+        level=levels.get(method.feedback, 1.0),
         reach=1e-3 * plan.sun_sensor.range_mrad,
         per_rad=(N_CAPTURE - 1) / TOP_RAD,
         control=control,
         **_sky(scenario),
         **_swing(gusts),
     )
-    return loop, law
+    drives = [drive_numbers(scenario, axis) for axis in (0, 1)]
+    return _kernels.Steering(loop, law, drives[0], drives[1], table)
 
 
 def _sky(scenario: Scenario) -> dict[str, Any]:

@@ -7,9 +7,9 @@ on the target, and the link to the kernel that moves the mirrors.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,21 +17,22 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.feedback import _kernels as mount_kernels
+from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.bus import BusSettings
 from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings, Orders
 from rfpose.feedback.fieldcontrol.modes import Event, Mode
-from rfpose.feedback.mount import aim_rows
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.campaign import Campaign
 from rfpose.feedback.tracking.hidden import Field, generator
+from rfpose.feedback.tracking.plant import Plant
+from rfpose.feedback.tracking.postures import aim_count
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.feedback.tracking.watch import AlarmWatch
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Event as Happening
 
-__all__ = ["Operation", "Told", "aim_count", "who_of"]
+__all__ = ["Operation", "who_of"]
 
 _SILENT_FRAMES = 5.0
 _WORDS_AHEAD = 4
@@ -51,58 +52,24 @@ _ON_RECEIVER = np.isin(np.arange(len(Mode)), [Mode.POINT, Mode.TRACK])
 _BACK = (Mode.STOW, Mode.STOWING, Mode.POWER_LOSS, Mode.FAULT)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """What mirrors are told until step ``until`` of the day; see `_kernels.advance`."""
-
-    until: int
-    duty: npt.NDArray[np.int64]
-    renew: npt.NDArray[np.uint8]
-    scored: npt.NDArray[np.uint8]
-    mode: npt.NDArray[np.int64]
-    aim: FloatArray
-    goal: FloatArray
-    heard: FloatArray
-    age: FloatArray
-
-    @classmethod
-    def always_track(cls, field: Field) -> Told:
-        """Return what mirrors do without field control: track their aim, by a sun that is known."""
-        n = len(field)
-        return cls(
-            until=0,
-            duty=np.full(n, _kernels.TRACK),
-            renew=np.zeros(n, np.uint8),
-            scored=np.ones(n, np.uint8),
-            mode=np.full(n, int(Mode.TRACK)),
-            aim=field.target[:, :3].copy(),
-            goal=np.zeros((n, 2)),
-            heard=np.zeros((n, 1, 3)),
-            age=np.full((n, 1), np.nan),
-        )
-
-
 class Operation:
     """One day of one method under field control.
 
     Parameters
     ----------
-    scenario, field, gusts
-        The run.
-    day, i_day
-        The day, and which of the run it is.
+    plant
+        The field; all methods begin the day with the same buses.
+    i_day
+        Which of its days.
     feedback
         What the method measures, by the kernels' number.
-    seed
-        Of the run: all methods begin the day with the same buses.
     """
 
-    def __init__(
-        self, scenario: Scenario, field: Field, gusts: Gusts, day: Day, *, i_day: int, feedback: int, seed: int
-    ) -> None:
+    def __init__(self, plant: Plant, i_day: int, *, feedback: int) -> None:
+        scenario, field, day = plant.scenario, plant.field, plant.days[i_day]
         plan = scenario.tracking
         assert plan.field_control is not None
-        self._plan, self._field, self._day, self._feedback, self._seed = plan, field, day, feedback, seed
+        self._plan, self._field, self._day, self._feedback, self._seed = plan, field, day, feedback, plant.seed
         self._servo_s = plan.servo_interval_s
         self._interval = round(plan.control_interval_s / self._servo_s)
         self._held = plan.field_control.between_messages == "held"
@@ -115,16 +82,17 @@ class Operation:
             settings=settings_of(scenario, arrived_rad=max(2e-3, 2.0 * step_rad)),
             bus=bus_of(scenario),
             mode=Mode.STOW if day.from_stow else Mode.TRACK,
-            rng=generator(seed, 40, i_day),
+            rng=generator(plant.seed, 40, i_day),
         )
-        self._wind_mps = _Wind(gusts, round(plan.field_control.wind_average_s / self._servo_s), day)
+        self._wind_mps = _Wind(plant.gusts, round(plan.field_control.wind_average_s / self._servo_s), day)
         self._events = _agenda(plan.event, day, i_day + 1, field, plan.field_control.bus.cluster_size)
         self._works_until = int(np.flatnonzero(day.works)[-1])
-        self._home, self._per_rad = field.constant[:, 15:17].copy(), field.constant[:, 13:15]
+        self._home = constant(field.constant, "angle_at_zero_rad").copy()
+        self._per_rad = constant(field.constant, "counts_per_unit")
         # the turn on which the park position lies within half a turn of the middle of the travel
         parked = self.control.settings.stow_axis_rad[0]
         self._home[:, 0] -= 2.0 * np.pi * np.rint((self._home[:, 0] - parked) / (2.0 * np.pi))
-        self.campaign = Campaign(scenario, field, feedback=feedback, seed=seed)
+        self.campaign = Campaign(scenario, field, feedback=feedback, seed=plant.seed)
         self.watch = AlarmWatch(n)
         self._out = np.ones(n, np.bool_)
         self._next_event = 0
@@ -149,28 +117,15 @@ class Operation:
 
     # -- going on ------------------------------------------------------------------------------------------
 
-    def tell(
-        self, s: int, span: tuple[int, int], *, state: FloatArray, model: FloatArray, true: FloatArray,
-        light: FloatArray, gust: npt.NDArray[np.float32],
-    ) -> Told:  # fmt: skip
-        """Let messages pass until step ``s`` of the day and return what the mirrors are told from there on.
+    def tell(self, s: int, stretch: _kernels.Stretch) -> tuple[int, _kernels.Tasks]:
+        """Let messages pass until step ``s`` of the day; return what mirrors are to do from there on, and until when.
 
-        For a second; for the rest of the control interval if all is quiet; for some intervals if it stays so.
-
-        Parameters
-        ----------
-        s, span
-            The step; first step and end of its stretch of the day, with which ``gust`` begins and beyond which nothing
-            is told.
-        state, model
-            Of the method's mirrors, as the kernels have them; a calibration changes the model, a homing the counts.
-        true : (mirror, 34)
-            Mounts as they are, what homing made of them included.
-        light : (mirror, 2)
-            Light caught and offered at the step before.
-        gust : (mirror, step)
-            Of the stretch [m/s].
+        For a second; for the rest of the control interval if all is quiet; for some intervals if it stays so; never
+        beyond the stretch. Light is that of the step before; a calibration changes the models, a homing the counts.
         """
+        state, light, model = stretch.memory.state, stretch.memory.light, stretch.models.parameters
+        gust = stretch.surroundings.gust
+        end = stretch.step0 + len(stretch.surroundings.power)
 
         def step(at: int) -> Orders:
             return self.control.step(
@@ -179,7 +134,7 @@ class Operation:
                 aim_axis_rad=aim_axis,
                 # held, a sun counts from the interval after it was sent: the centre says where it will be then
                 sun_enu=self._day.sun_enu[at + (self._interval if self._held else 0)],
-                wind_m_s=self._wind_mps.at(at, span[0], gust),
+                wind_mps=self._wind_mps.at(at, stretch.step0, gust),
                 feedback_valid=self._valid(state),
                 found=self.campaign.found,
             )
@@ -190,21 +145,21 @@ class Operation:
         if orders is None:
             self._let_happen(s, light, axis)
             self._programme(s)
-            self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, true)
+            self.campaign.proceed(self.control, s, self._day, self._last_aim, state, model, stretch.mounts.true)
             aim_axis = self._aim_axis_rad(s, state, model)
             orders = step(s)
         self._home_counts(orders.mode, state, s)
         self.watch.observe(s * self._servo_s, orders.mode, light, orders.alarms)
         words = [orders]
         until, quiet = self._holds_until(s)
-        while quiet and len(words) < _WORDS_AHEAD and until < span[1] and self._calm(until):
+        while quiet and len(words) < _WORDS_AHEAD and until < end and self._calm(until):
             later = step(until)
             if later.changed.any() or later.alarms != orders.alarms:
                 self._ahead = later
                 break
             words.append(later)
             until, quiet = self._holds_until(until)
-        return self._told(words, s, min(until, span[1]), state)
+        return min(until, end), self._tasks(words, s, state)
 
     def _calm(self, s: int) -> bool:
         """Whether nothing but messages goes on at the control interval that begins at step ``s``."""
@@ -243,7 +198,7 @@ class Operation:
         """Return local mean solar time so long after the day's first step [h]."""
         return float(self._day.hour[round(at_s / self._servo_s)])
 
-    def _told(self, words: list[Orders], s: int, until: int, state: FloatArray) -> Told:
+    def _tasks(self, words: list[Orders], s: int, state: FloatArray) -> _kernels.Tasks:
         orders = words[0]
         mode = orders.mode.astype(np.int64)
         follows = _FOLLOWS[mode] & np.isfinite(orders.sun_enu).all(axis=1)
@@ -257,8 +212,7 @@ class Operation:
         since = np.array([word.time_s / self._servo_s - s for word in words])
         age = np.stack([word.sun_age_s / self._servo_s for word in words], axis=1) - since
         heard = np.stack([word.sun_enu for word in words], axis=1)
-        return Told(
-            until=until,
+        return _kernels.Tasks(
             duty=duty,
             renew=renew.astype(np.uint8),
             scored=(_ON_RECEIVER[mode] & follows).astype(np.uint8),
@@ -422,21 +376,15 @@ def bus_of(scenario: Scenario) -> BusSettings:
 
 
 def settings_of(scenario: Scenario, *, arrived_rad: float) -> FieldSettings:
-    """Return the behaviour of field control that a scenario asks for."""
+    """Return the behaviour of field control that a scenario asks for: what both know by the same name, as it stands."""
     plan = scenario.tracking.field_control
     assert plan is not None
+    names = {f.name for f in dataclasses.fields(FieldSettings)}
     return FieldSettings(
         stow_axis_rad=(float(np.deg2rad(plan.stow_deg[0])), float(np.deg2rad(plan.stow_deg[1]))),
         arrived_rad=arrived_rad,
-        emergency_hold_s=plan.emergency_hold_s,
-        watchdog_intervals=plan.watchdog_intervals,
-        defocus_offset_m=plan.defocus_offset_m,
         search_step_m=0.5 * plan.calibration_target_m,
-        search_dwell_s=plan.search_dwell_s,
-        search_cells=plan.search_cells,
-        wind_stow_m_s=plan.wind_stow_mps,
-        wind_release_m_s=plan.wind_release_mps,
-        wind_release_s=plan.wind_release_s,
+        **plan.model_dump(include=names),
     )
 
 
@@ -481,21 +429,6 @@ def _agenda(
         if event.day in (None, number):
             found.append((int(np.searchsorted(day.hour, event.hour)), event, who))
     return sorted(found, key=lambda each: each[0])
-
-
-def aim_count(
-    model: FloatArray, constant: FloatArray, sun_enu: FloatArray, target: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.int8]]:
-    """Return motor counts at which models send the sun to targets (mirror, 2), NaN where they cannot, and why.
-
-    The status is 0 if they can, 1 where there is no posture, 2 beyond the limits.
-    """
-    n, dish = len(model), bool(target[0, 3])
-    sun = np.broadcast_to(sun_enu, (n, 1, 3))
-    goal = sun if dish else target[:, None, :3]
-    rows = aim_rows(sun, goal, source_is_point=False, target_is_point=not dish)
-    count, status = mount_kernels.command_batch(model, constant, np.ascontiguousarray(rows))
-    return np.where(status != 0, np.nan, count[:, 0]), status[:, 0]
 
 
 def _counted(reasons: Mapping[int, str]) -> dict[str, int]:

@@ -8,21 +8,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfpose import geometry
 from rfpose.checks import FloatArray
-from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo.margins import Margins
-from rfpose.feedback.tracking.capture import capture_table
-from rfpose.feedback.tracking.hidden import Field, draw_field, generator
-from rfpose.feedback.tracking.instruments import Workshop
+from rfpose.feedback.tracking.calibrations import Calibrator
+from rfpose.feedback.tracking.engine import Arrays, Draws
+from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import choose
-from rfpose.feedback.tracking.operation import aim_count, who_of
+from rfpose.feedback.tracking.operation import who_of
+from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.radio import RadioModel
-from rfpose.feedback.tracking.run import Arrays, Curves, Draws, MethodRun, Segment, Sums, World
-from rfpose.feedback.tracking.sky import under_sky
-from rfpose.feedback.tracking.timeline import Day, days
-from rfpose.feedback.tracking.wind import Gusts
+from rfpose.feedback.tracking.run import Curves, Kept, MethodRun, Segment, Sums
 from rfpose.scenario import Scenario
 
 __all__ = ["Curves", "Simulation", "Sums"]
@@ -58,18 +55,15 @@ class Simulation:
         if isinstance(seed, bool) or seed < 0:
             raise InvalidInputError(f"`seed` must be a non-negative integer, got {seed!r}")
         plan = scenario.tracking
-        self.scenario, self.seed = scenario, int(seed)
+        self.scenario = scenario
         self.methods = choose(methods, collector=plan.collector)
-        self.days: tuple[Day, ...] = under_sky(scenario, days(scenario), seed=self.seed)
-        course = self.days[0].sun_enu[:: max(1, round(60.0 / plan.servo_interval_s))]
-        self.field: Field = draw_field(scenario, count=count, seed=self.seed, sun_enu=course)
-        self.gusts = Gusts(scenario)
-        self.gusts.check_covers(self.days)
+        self.plant = Plant(scenario, count=count, seed=int(seed))
+        self.field, self.days = self.plant.field, self.plant.days
         needs_radio = any(m.radio for m in self.methods)
         self.margins: Margins | None = check_gains(scenario) if needs_radio else None
-        self.radio = None
+        self.radio: RadioModel | None = None
         if needs_radio:
-            usual = self.wanted_normal_enu(self.days[0], int(np.argmax(self.days[0].sun_enu[:, 2])))
+            usual = self.plant.usual_normal_enu()
             self.radio = RadioModel(scenario, self.field.pivot_enu_m, usual_normal_enu=usual)
         n = len(self.field)
         self.stored = np.unique(np.linspace(0, n - 1, min(plan.stored, n)).astype(np.int64))
@@ -78,21 +72,12 @@ class Simulation:
         if plan.field_control is not None:
             for event in plan.event:  # refuse names that nobody has before days go by
                 who_of(event, self.field, plan.field_control.bus.cluster_size)
-        self.world = World(
-            scenario=scenario,
-            seed=self.seed,
-            field=self.field,
-            gusts=self.gusts,
-            days=self.days,
-            workshop=Workshop(scenario, self.field, self.radio, self.gusts, seed=self.seed),
-            table=capture_table(scenario),
-            stored=self.stored,
-            stride=self._stride,
-        )
-        self._runs = {m.name: MethodRun(m, self.world) for m in self.methods}
-        self._gust_state = self.gusts.process.start(generator(self.seed, 1, 0), n)
+        calibrator = Calibrator(self.plant, self.radio)
+        kept = Kept(stored=self.stored, stride=self._stride)
+        self._runs = {m.name: MethodRun(m, self.plant, calibrator, kept) for m in self.methods}
+        self._gust_state = self.plant.gusts.process.start(generator(self.plant.seed, 1, 0), n)
         self.done = 0
-        self._check_reach()
+        self.plant.check_reach()
 
     # -- plan ----------------------------------------------------------------------------------------------
 
@@ -133,64 +118,47 @@ class Simulation:
             stored += -(-n_step // self._stride)
         return tuple(found)
 
-    def _check_reach(self) -> None:
-        """Refuse a field of which no mirror reaches its aim at noon."""
-        day = self.days[0]
-        noon = day.sun_enu[int(np.argmax(day.sun_enu[:, 2]))]
-        count, status = aim_count(self.field.nominal, self.field.constant, noon, self.field.target)
-        if not np.isfinite(count).any():
-            raise ScenarioError(
-                f"no mirror reaches its aim point on {day.date} at noon: {self.field.ids[0]} is "
-                f"{'beyond its limits' if status[0] == 2 else 'without a posture'}; check `aim_enu_m` and "
-                "[tracking.drive] limits"
-            )
-
     # -- go on ---------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
         """Simulate the next stretch of time."""
         segment = self.segments[self.done]
-        day = self.days[segment.i_day]
-        plan, n = self.scenario.tracking, len(self.field)
         if segment.first == 0:
-            self._gust_state[:] = self.gusts.process.start(generator(self.seed, 1, segment.i_day), n)
+            start = generator(self.plant.seed, 1, segment.i_day)
+            self._gust_state[:] = self.plant.gusts.process.start(start, len(self.field))
             for run in self._runs.values():
                 run.begin_day(segment.i_day)
-        place = (segment.i_day, segment.first)
-        n_step = segment.end - segment.first
-        control = round(plan.control_interval_s / plan.servo_interval_s)
-        n_frame = -(-n_step // control)
-        gust = self.gusts.run(
-            self._gust_state, generator(self.seed, 2, *place), day.unix_s[segment.first : segment.end]
-        )
-        rng = generator(self.seed, 3, *place)
-        noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
-        lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
-        outage = self._outage(day.hour[segment.first : segment.end])
-        spread, bias = np.zeros((n, 3)), np.zeros((n, 2))
-        if self.radio is not None:
-            errors = self.radio.errors(self.wanted_normal_enu(day, (segment.first + segment.end) // 2), rng)
-            spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
-            lost[~errors.solved] = 1
-        draws = Draws(
-            gust=gust,
-            swing=self.gusts.draw_swing(rng, (n, n_step)),
-            noise=noise,
-            lost=lost,
-            outage=outage,
-            spread=spread,
-            bias=bias,
-        )
+        draws = self._draw(segment)
         for run in self._runs.values():
             run.go_through(segment, draws)
         self.done += 1
 
-    def wanted_normal_enu(self, day: Day, i_step: int) -> FloatArray:
-        """Return the normals that nominal mirrors should have at a step of a day (mirror, xyz)."""
-        sun = day.sun_enu[i_step]
-        if self.field.target[0, 3]:
-            return np.broadcast_to(sun, (len(self.field), 3)).copy()
-        return geometry.bisector_enu(self.field.target[:, :3] - self.field.pivot_enu_m, sun)
+    def _draw(self, segment: Segment) -> Draws:
+        """Draw what a stretch brings to all methods."""
+        plant, plan, day, n = self.plant, self.scenario.tracking, self.days[segment.i_day], len(self.field)
+        steps = slice(segment.first, segment.end)
+        n_step = segment.end - segment.first
+        n_frame = -(-n_step // round(plan.control_interval_s / plan.servo_interval_s))
+        place = (segment.i_day, segment.first)
+        gust = plant.gusts.run(self._gust_state, generator(plant.seed, 2, *place), day.unix_s[steps])
+        rng = generator(plant.seed, 3, *place)
+        noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
+        lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
+        spread, bias = np.zeros((n, 3)), np.zeros((n, 2))
+        if self.radio is not None:
+            errors = self.radio.errors(plant.wanted_normal_enu(day, (segment.first + segment.end) // 2), rng)
+            spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
+            lost[~errors.solved] = 1
+        return Draws(
+            mean_mps=plant.gusts.mean_mps,
+            gust=gust,
+            swing=plant.gusts.draw_swing(rng, (n, n_step)),
+            noise=noise,
+            lost=lost,
+            outage=self._outage(day.hour[steps]),
+            spread=spread,
+            bias=bias,
+        )
 
     def _outage(self, hour: FloatArray) -> npt.NDArray[np.uint8]:
         """(mirror, step) which of the outages has taken the radio, from 1; 0 none."""
@@ -198,7 +166,7 @@ class Simulation:
         out = np.zeros((n, len(hour)), np.uint8)
         for i, outage in enumerate(self.scenario.tracking.radio.outages):
             dark = (hour >= outage.first_hour) & (hour < outage.last_hour)
-            hit = generator(self.seed, 8, i).random(n) < outage.share
+            hit = generator(self.plant.seed, 8, i).random(n) < outage.share
             out[hit[:, None] & dark[None]] = i + 1
         return out
 

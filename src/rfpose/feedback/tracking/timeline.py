@@ -15,7 +15,7 @@ from rfpose.feedback.sun import Site, sun_position
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Tracking
 
-__all__ = ["Day", "day_of", "days", "hour_of_day", "site_of", "ways_s"]
+__all__ = ["Day", "day_of", "days", "heat_of", "hour_of_day", "look_times", "site_of", "ways_s"]
 
 _COARSE_S = 20.0
 _MARGIN_S = 120.0
@@ -56,8 +56,8 @@ class Day:
 
     @property
     def heat(self) -> FloatArray:
-        """(step,) how warm it is: −1 … 1 over the day, greatest at three in the afternoon."""
-        return np.asarray(np.cos(2.0 * np.pi * (self.hour - 15.0) / 24.0))
+        """(step,) how warm it is, see `heat_of`."""
+        return heat_of(self.hour)
 
 
 def site_of(scenario: Scenario) -> Site:
@@ -81,6 +81,11 @@ def site_of(scenario: Scenario) -> Site:
 def hour_of_day(unix_s: npt.ArrayLike, site: Site) -> FloatArray:
     """Return local mean solar time [h]."""
     return np.asarray(np.mod(np.asarray(unix_s) / 3600.0 + np.rad2deg(site.longitude_rad) / 15.0, 24.0))
+
+
+def heat_of(hour: FloatArray) -> FloatArray:
+    """Return how warm it is at hours: −1 … 1 over the day, greatest at three in the afternoon."""
+    return np.asarray(np.cos(2.0 * np.pi * (hour - 15.0) / 24.0))
 
 
 def days(scenario: Scenario) -> tuple[Day, ...]:
@@ -136,6 +141,13 @@ def day_of(scenario: Scenario, date: datetime.date, since_first: int, *, whole: 
         works=read_only((times[:n_step] >= begin) & (times[:n_step] <= end)),
         from_stow=from_stow,
     )
+
+
+def look_times(scenario: Scenario, since_first: int, n: int) -> FloatArray:
+    """Return instants evenly spread over the sunshine of a day, so many days after the run's first (n,) [s]."""
+    date = scenario.tracking.date + datetime.timedelta(days=since_first)
+    unix_s = day_of(scenario, date, since_first, whole=True).unix_s
+    return np.linspace(unix_s[0], unix_s[-1], n + 2)[1:-1]
 
 
 def ways_s(plan: Tracking) -> float:

@@ -17,10 +17,16 @@ from rfpose.feedback.wind.spectrum import wind_deflection
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Tracking
 
-__all__ = ["Gusts"]
+__all__ = ["Gusts", "structure_of"]
 
 _BLOCK = 2000
 """Mirrors drawn at a time, to bound the memory."""
+
+
+def structure_of(scenario: Scenario) -> Structure | None:
+    """Return what lies between drive and mirror; None: nothing that swings."""
+    mode = scenario.tracking.structure
+    return Structure(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None
 
 
 class Gusts:
@@ -58,14 +64,14 @@ class Gusts:
         self.process = gust_process(
             self.mean_mps, interval_s=plan.servo_interval_s, size_m=float(np.sqrt(plan.mirror_area_m2))
         )
-        self.swings = plan.structure.natural_hz > 0.0
+        mode = structure_of(scenario)
+        self.swings = mode is not None
         self.swing_sigma_rad: FloatArray = np.zeros(2)
         self.transition, self.root = np.zeros((2, 2)), np.zeros((2, 2))
-        if self.swings:
-            self._structure(plan)
+        if mode is not None:
+            self._structure(plan, mode)
 
-    def _structure(self, plan: Tracking) -> None:
-        mode = Structure(natural_hz=plan.structure.natural_hz, damping=plan.structure.damping)
+    def _structure(self, plan: Tracking, mode: Structure) -> None:
         self.transition, self.root = swing_transition(mode, interval_s=plan.servo_interval_s)
         if self.mean_mps > 0.0:
             size_m = float(np.sqrt(plan.mirror_area_m2))
