@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rfpose.feedback.tracking import Simulation
-from rfpose.pipeline.track import track
+from rfpose.pipeline.track import TrackChanges, track
 from rfpose.pipeline.track_pictures import draw_track
 from rfpose.scenario import load_scenario
 
@@ -69,7 +69,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         found = track(SCENARIO, Path(temporary) / "day.h5")
         methods = ("camera-model", "radio-both")
-        eventful = track(SCENARIO, Path(temporary) / "events.h5", methods=methods, events=EVENTS)
+        eventful = track(SCENARIO, Path(temporary) / "events.h5", methods=methods, changes=TrackChanges(events=EVENTS))
     draw_track(found, directory / "tracking_day.png")
     draw_track(eventful, directory / "tracking_events.png")
     draw_outage(directory / "tracking_outage.png")

@@ -22,7 +22,7 @@ from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate_recording
-from rfpose.pipeline.track import track
+from rfpose.pipeline.track import TrackChanges, track
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.export import open_window, png_of, settle
 from rfpose.viewer.views.live import LiveView
@@ -156,7 +156,7 @@ def main() -> None:
         site(folder)
         simulate_recording(scenario, recording, seed=1)
         process(recording, result)
-        track(shipped_scenario("tracking_100m.toml"), day, events=EVENTS)
+        track(shipped_scenario("tracking_100m.toml"), day, changes=TrackChanges(events=EVENTS))
         welcome(out / "viewer_welcome.png", scenario)
         shoot(recording, out / "viewer_recording.png", view="recording", frame=3, transmitter=2)
         shoot(recording, out / "viewer_recording_dark.png", view="recording", frame=3, transmitter=2, theme="dark")

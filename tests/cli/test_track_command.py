@@ -12,7 +12,7 @@ from rfpose.cli import _app
 from rfpose.cli.track import _METHODS
 from rfpose.errors import RecordingError
 from rfpose.feedback.tracking import METHODS
-from rfpose.pipeline.track import track
+from rfpose.pipeline.track import TrackChanges, track
 from rfpose.pipeline.track_file import is_track, read_track
 from rfpose.scenario import load_scenario
 
@@ -215,7 +215,12 @@ def test_stopped_in_an_emergency_and_resumed_equals_undisturbed(site, tmp_path):
     whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
     # a stretch ends a quarter of an hour after nine
     events = [{"hour": 9.24, "what": "emergency"}, {"hour": 9.4, "what": "release"}]
-    arguments = {"methods": ("open-loop", "encoder"), "heliostats": 3, "seed": 5, "events": events}
+    arguments = {
+        "methods": ("open-loop", "encoder"),
+        "heliostats": 3,
+        "seed": 5,
+        "changes": TrackChanges(events=events),
+    }
     track(site, whole, **arguments)
 
     def stop(done, total):
@@ -225,9 +230,9 @@ def test_stopped_in_an_emergency_and_resumed_equals_undisturbed(site, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             track(site, parts, **arguments, checkpoint_s=0.0, on_progress=stop)
     with pytest.raises(RecordingError, match="another job"):
-        track(site, parts, **arguments | {"events": events[:1]})
+        track(site, parts, **arguments | {"changes": TrackChanges(events=events[:1])})
     with pytest.raises(RecordingError, match="another job"):
-        track(site, parts, **arguments | {"events": (), "without_field_control": True})
+        track(site, parts, **arguments | {"changes": TrackChanges(without_field_control=True)})
     seen = []
     resumed = track(site, parts, **arguments, on_progress=lambda done, total: seen.append(done))
     assert seen == [3]

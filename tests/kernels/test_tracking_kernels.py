@@ -7,6 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rfpose.feedback.columns import PARAMETERS, constant
+from rfpose.feedback.mount import Actuator, Mount, posture
+from rfpose.feedback.tracking import Simulation
+from rfpose.scenario import Scenario, load_scenario
+
 ROOT = Path(__file__).resolve().parents[2]
 
 # a dish and a heliostat by every kind of feedback, for three minutes
@@ -70,3 +75,36 @@ def test_compiled_equals_plain_python(tmp_path):
             np.testing.assert_allclose(values.sum(), plain[name].sum(), rtol=1e-6, err_msg=name)
         else:
             np.testing.assert_allclose(values, plain[name], rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def test_mirrors_stand_as_their_mounts_say_by_the_names_of_parameters():
+    data = load_scenario(ROOT / "data" / "tracking_100m.toml").model_dump(exclude_none=True)
+    data["tracking"] |= {
+        "first_hour": 9.0, "last_hour": 9.05, "store_interval_s": 16.0, "stored": 3, "wind": {"mean_speed_mps": 0.0},
+        "structure": {"natural_hz": 0.0}, "drive": {"backlash_mrad": (0.0, 0.0)},
+        "mount_errors": {"thermal_sigma_mrad": 3.0, "sag_sigma_mrad": 2.0, "worm_sigma_mrad": 2.0},
+    }  # fmt: skip
+    del data["tracking"]["field_control"]
+    simulation = Simulation(Scenario.model_validate(data), methods=("open-loop",), count=3, seed=2)
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+    field, day, curves = simulation.field, simulation.days[0], simulation.curves("open-loop")
+    for row in range(3):
+        zero_rad, ratio = (constant(field.constant, name)[row] for name in ("angle_at_zero_rad", "worm_ratio"))
+        axes = [
+            Actuator(counts_per_unit=48_000.0 / (2.0 * np.pi), angle_at_zero_rad=zero_rad[a], worm_ratio=ratio[a])
+            for a in range(2)
+        ]
+        mount = Mount(
+            pivot_enu_m=field.pivot_enu_m[row],
+            actuators=(axes[0], axes[1]),
+            parameters=dict(zip(PARAMETERS, field.true[row], strict=True)),
+        )
+        for t, heat in enumerate(day.heat[::16]):
+            # the pedestal leans by day
+            tilts = {
+                f"pedestal_tilt_{way}_rad": mount.parameters[f"pedestal_tilt_{way}_rad"] + lean * heat
+                for way, lean in zip(("north", "east"), field.lean_rad[row], strict=True)
+            }
+            wanted = posture(mount.replace(**tilts), curves.motor_count[t, row]).normal_enu
+            np.testing.assert_allclose(curves.normal_enu[t, row], wanted, atol=1e-12)

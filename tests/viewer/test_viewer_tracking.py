@@ -15,7 +15,7 @@ from PySide6.QtCore import QPointF, Qt
 from rfpose.cli import _app
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.pipeline.demo import shipped_scenario
-from rfpose.pipeline.track import track
+from rfpose.pipeline.track import TrackChanges, track
 from rfpose.pipeline.track_file import Track, read_track
 from rfpose.pipeline.track_pictures import draw_track
 from rfpose.pipeline.track_view import MODES, clock, groups, instant_at, local_hour, picture_of_track, what_happened
@@ -49,8 +49,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     site.write_text(short_day().to_toml())
     paths = {"control": folder / "control.h5", "without": folder / "without.h5"}
     methods = ["open-loop", "camera-model"]
-    track(site, paths["control"], methods=methods, heliostats=4, events=EVENTS)
-    track(site, paths["without"], methods=methods, heliostats=4, days=2, without_field_control=True)
+    track(site, paths["control"], methods=methods, heliostats=4, changes=TrackChanges(events=EVENTS))
+    track(
+        site, paths["without"], methods=methods, heliostats=4, changes=TrackChanges(days=2, without_field_control=True)
+    )
     return paths
 
 

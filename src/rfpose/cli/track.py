@@ -104,18 +104,20 @@ def command(
     happenings = [_event(text) for text in events]
     claimed = outputs(output, csv_path, picture, inputs=[scenario], force=force)
     with claimed, progress("Tracking") as on_progress:
-        from rfpose.pipeline.track import track
+        from rfpose.pipeline.track import TrackChanges, track
 
         found = track(
             scenario,
             output,
             methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
-            days=days,
-            day_interval=day_interval,
+            changes=TrackChanges(
+                days=days,
+                day_interval=day_interval,
+                sky=sky,
+                events=happenings,
+                without_field_control=without_field_control,
+            ),
             heliostats=heliostats,
-            sky=sky,
-            events=happenings,
-            without_field_control=without_field_control,
             check_iq=tuple(name.strip() for name in check_iq.split(",")) if check_iq else (),
             seed=seed,
             force=force,

@@ -12,7 +12,10 @@ from rfpose.feedback.columns import MEASUREMENT, K, M, P
 from rfpose.jit import kernel, kernel_parallel, prange
 
 N_ROW = sum(MEASUREMENT.values())
-N_PREPARED = 16
+# what is prepared of a mount: rotation by rows, pivot, opening angles at count zero, sine and cosine of the
+# non-orthogonality, normals in the mirror's frame: its own, the receivers' plane's
+PIVOT, OPENING, OBLIQUE, MIRROR, PLANE = 9, 12, 14, 16, 19
+N_PREPARED = 22
 # Median of a Rayleigh variable in units of its sigma: the residual has two components.
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
@@ -28,8 +31,8 @@ def _opening(length, radius, offset):
 
 
 @kernel
-def _prepare(p, k, out):
-    """What does not depend on the posture: rotation (9), pivot (3), opening angles at count zero (2)."""
+def prepare(p, k, out):
+    """Prepare what does not depend on the posture."""
     cn, sn = math.cos(p[P.pedestal_tilt_north_rad]), math.sin(p[P.pedestal_tilt_north_rad])
     ce, se = math.cos(p[P.pedestal_tilt_east_rad]), math.sin(p[P.pedestal_tilt_east_rad])
     ct, st = math.cos(p[P.pedestal_twist_rad]), math.sin(p[P.pedestal_twist_rad])
@@ -40,25 +43,33 @@ def _prepare(p, k, out):
         x, z = ce * x + se * z, ce * z - se * x  # tilt towards east
         out[j], out[3 + j], out[6 + j] = x, y, z
     length = p[P.pylon_length_m]
-    out[9] = k[K.pivot_enu_m] + p[P.location_east_m] + length * se * cn
-    out[10] = k[K.pivot_enu_m + 1] + p[P.location_north_m] + length * sn
-    out[11] = k[K.pivot_enu_m + 2] + p[P.location_up_m] + length * (ce * cn - 1.0)
+    out[PIVOT] = k[K.pivot_enu_m] + p[P.location_east_m] + length * se * cn
+    out[PIVOT + 1] = k[K.pivot_enu_m + 1] + p[P.location_north_m] + length * sn
+    out[PIVOT + 2] = k[K.pivot_enu_m + 2] + p[P.location_up_m] + length * (ce * cn - 1.0)
     for a in range(2):
-        out[12 + a] = (
-            _opening(p[P.actuator_1_stroke_m + a], p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a])
-            if k[K.is_linear + a] > 0.5
-            else 0.0
-        )
+        out[OPENING + a] = 0.0
+        if k[K.is_linear + a] > 0.5:
+            stroke = p[P.actuator_1_stroke_m + a]
+            out[OPENING + a] = _opening(stroke, p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a])
+    out[OBLIQUE] = math.sin(p[P.nonorthogonality_rad])
+    out[OBLIQUE + 1] = math.cos(p[P.nonorthogonality_rad])
+    for receiver in range(2):
+        # canting in the mirror frame: towards right, towards up
+        across = p[P.canting_right_rad] + receiver * p[P.receiver_plane_right_rad]
+        along = p[P.canting_up_rad] + receiver * p[P.receiver_plane_up_rad]
+        inverse = 1.0 / math.sqrt(1.0 + across * across + along * along)
+        at = PLANE if receiver else MIRROR
+        out[at], out[at + 1], out[at + 2] = across * inverse, along * inverse, inverse
 
 
 @kernel
-def _axis(a, count, p, k, prepared):
+def axis_angle(a, count, p, k, prepared):
     """Angle of axis ``a`` at a motor position."""
     travel = count / k[K.counts_per_unit + a] * (1.0 + p[P.axis_1_gain + a])
     if k[K.is_linear + a] > 0.5:
         travel = (
             _opening(p[P.actuator_1_stroke_m + a] + travel, p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a])
-            - prepared[12 + a]
+            - prepared[OPENING + a]
         )
     angle = k[K.angle_at_zero_rad + a] + k[K.sign + a] * travel + p[P.axis_1_zero_rad + a]
     turn = k[K.worm_ratio + a] * angle
@@ -69,18 +80,20 @@ def _axis(a, count, p, k, prepared):
 
 
 @kernel
-def _posture(azimuth, elevation, p, prepared, receiver, out):
+def posture(azimuth, elevation, p, prepared, receiver, out):
     """Mirror normal (3) and centre (3) in ENU at two axis angles."""
     sa, ca = math.sin(azimuth), math.cos(azimuth)
-    se, ce = math.sin(elevation), math.cos(elevation)
-    sd, cd = math.sin(p[P.nonorthogonality_rad]), math.cos(p[P.nonorthogonality_rad])
-    # canting in the mirror frame: towards right, towards up
-    across = p[P.canting_right_rad] + receiver * p[P.receiver_plane_right_rad]
-    along = p[P.canting_up_rad] + receiver * p[P.receiver_plane_up_rad]
-    inverse = 1.0 / math.sqrt(1.0 + across * across + along * along)
+    _pose(sa, ca, math.sin(elevation), math.cos(elevation), p, prepared, receiver, out)
+
+
+@kernel
+def _pose(sa, ca, se, ce, p, prepared, receiver, out):
+    """The same at sines and cosines of the axis angles."""
+    sd, cd = prepared[OBLIQUE], prepared[OBLIQUE + 1]
+    at = PLANE if receiver > 0.5 else MIRROR
     for which in range(2):
         if which == 0:
-            r, up, n, ahead = across * inverse, along * inverse, inverse, 0.0
+            r, up, n, ahead = prepared[at], prepared[at + 1], prepared[at + 2], 0.0
         else:
             r, up, n, ahead = p[P.arm_right_m], p[P.arm_up_m], p[P.arm_normal_m], p[P.axis_offset_m]
         # frame of axis 1: right, forward, up; then axis 2's non-orthogonality, about forward
@@ -92,7 +105,7 @@ def _posture(azimuth, elevation, p, prepared, receiver, out):
         y = ca * f + sa * r
         for i in range(3):
             value = prepared[3 * i] * x + prepared[3 * i + 1] * y + prepared[3 * i + 2] * u
-            out[3 * which + i] = value + (prepared[9 + i] if which == 1 else 0.0)
+            out[3 * which + i] = value + (prepared[PIVOT + i] if which == 1 else 0.0)
     sag = p[P.gravity_sag_rad]
     if sag != 0.0:
         z = out[2]
@@ -102,7 +115,13 @@ def _posture(azimuth, elevation, p, prepared, receiver, out):
 
 
 @kernel
-def _bisector(m, centre, out):
+def stand(count_1, count_2, p, k, prepared, receiver, out):
+    """Mirror normal and centre at two motor positions."""
+    posture(axis_angle(0, count_1, p, k, prepared), axis_angle(1, count_2, p, k, prepared), p, prepared, receiver, out)
+
+
+@kernel
+def bisector(m, centre, out):
     """Normal that sends the row's source to its target from a mirror centre."""
     from_point, to_point = m[M.source_is_point], m[M.target_is_point]
     s0 = m[M.source_enu] - from_point * centre[0]
@@ -127,19 +146,19 @@ def _residuals(p, k, count, row, use, out):
     state = np.empty(6)
     wanted = np.empty(3)
     seen = np.empty(N_ROW)
-    _prepare(p, k, prepared)
+    prepare(p, k, prepared)
     for i in range(len(row)):
         if not use[i]:
             out[i, 0] = out[i, 1] = out[i, 2] = 0.0
             continue
-        azimuth = _axis(0, count[i, 0], p, k, prepared)
-        elevation = _axis(1, count[i, 1], p, k, prepared)
-        _posture(azimuth, elevation, p, prepared, row[i, M.of_receiver_plane], state)
+        azimuth = axis_angle(0, count[i, 0], p, k, prepared)
+        elevation = axis_angle(1, count[i, 1], p, k, prepared)
+        posture(azimuth, elevation, p, prepared, row[i, M.of_receiver_plane], state)
         for j in range(N_ROW):
             seen[j] = row[i, j]
         for j in range(3):  # a drone's camera sits beside its antenna
             seen[M.source_enu + j] += seen[M.source_is_point] * p[P.drone_camera_east_m + j]
-        _bisector(seen, state[3:], wanted)
+        bisector(seen, state[3:], wanted)
         for j in range(3):
             out[i, j] = (state[j] - wanted[j]) / row[i, M.sigma_rad]
 
@@ -180,11 +199,11 @@ def posture_batch(p, k, count, receiver):
     out = np.empty((len(p), count.shape[1], 8))
     for h in prange(len(p)):
         prepared = np.empty(N_PREPARED)
-        _prepare(p[h], k[h], prepared)
+        prepare(p[h], k[h], prepared)
         for i in range(count.shape[1]):
-            out[h, i, 0] = _axis(0, count[h, i, 0], p[h], k[h], prepared)
-            out[h, i, 1] = _axis(1, count[h, i, 1], p[h], k[h], prepared)
-            _posture(out[h, i, 0], out[h, i, 1], p[h], prepared, receiver, out[h, i, 2:])
+            out[h, i, 0] = axis_angle(0, count[h, i, 0], p[h], k[h], prepared)
+            out[h, i, 1] = axis_angle(1, count[h, i, 1], p[h], k[h], prepared)
+            posture(out[h, i, 0], out[h, i, 1], p[h], prepared, receiver, out[h, i, 2:])
     return out
 
 
@@ -193,7 +212,7 @@ def _count_guess(a, angle, p, k, prepared):
     """Motor position for an axis angle, worm gear left out; NaN where the actuator cannot reach it."""
     travel = (angle - k[K.angle_at_zero_rad + a] - p[P.axis_1_zero_rad + a]) * k[K.sign + a]
     if k[K.is_linear + a] > 0.5:
-        opening = travel + prepared[12 + a]
+        opening = travel + prepared[OPENING + a]
         if opening < 0.0 or opening > math.pi:
             return np.nan
         radius, offset = p[P.actuator_1_radius_m + a], p[P.actuator_1_offset_m + a]
@@ -203,11 +222,24 @@ def _count_guess(a, angle, p, k, prepared):
 
 
 @kernel
-def _command_one(p, k, prepared, m, out, state, moved, wanted):
+def _worm(p, k, a, angle):
+    """How far a worm gear has to turn its axis for the axis to be at an angle: Newton's method."""
+    sine, cosine, ratio = p[P.worm_1_sin_rad + 2 * a], p[P.worm_1_cos_rad + 2 * a], k[K.worm_ratio + a]
+    worm = 0.0
+    if sine == 0.0 and cosine == 0.0:
+        return worm
+    for _ in range(5):
+        s, c = math.sin(ratio * (angle - worm)), math.cos(ratio * (angle - worm))
+        worm -= (worm - sine * s - cosine * c) / (1.0 + ratio * (sine * c - cosine * s))
+    return worm
+
+
+@kernel
+def command_one(p, k, prepared, m, out, state, wanted):
     """Axis angles, then counts, that make the mirror send the row's source to its target; returns 0 if done."""
     for i in range(3):
-        state[3 + i] = prepared[9 + i]
-    _bisector(m, state[3:], wanted)
+        state[3 + i] = prepared[PIVOT + i]
+    bisector(m, state[3:], wanted)
     # back into the nominal mount frame for a first guess
     x = prepared[0] * wanted[0] + prepared[3] * wanted[1] + prepared[6] * wanted[2]
     y = prepared[1] * wanted[0] + prepared[4] * wanted[1] + prepared[7] * wanted[2]
@@ -216,19 +248,24 @@ def _command_one(p, k, prepared, m, out, state, moved, wanted):
     elevation = math.atan2(z, math.hypot(x, y))
     done = False
     for _ in range(30):
-        _posture(azimuth, elevation, p, prepared, 0.0, state)
-        _bisector(m, state[3:], wanted)
-        e0, e1, e2 = wanted[0] - state[0], wanted[1] - state[1], wanted[2] - state[2]
+        sa, ca = math.sin(azimuth), math.cos(azimuth)
+        _pose(sa, ca, math.sin(elevation), math.cos(elevation), p, prepared, 0.0, state)
+        bisector(m, state[3:], wanted)
+        n0, n1, n2 = state[0], state[1], state[2]
+        e0, e1, e2 = wanted[0] - n0, wanted[1] - n1, wanted[2] - n2
         if not (e0 * e0 + e1 * e1 + e2 * e2 < 10.0):
             return 1
         if e0 * e0 + e1 * e1 + e2 * e2 < 1e-26:
             done = True
             break
-        h = 1e-6
-        _posture(azimuth + h, elevation, p, prepared, 0.0, moved)
-        a0, a1, a2 = (moved[0] - state[0]) / h, (moved[1] - state[1]) / h, (moved[2] - state[2]) / h
-        _posture(azimuth, elevation + h, p, prepared, 0.0, moved)
-        b0, b1, b2 = (moved[0] - state[0]) / h, (moved[1] - state[1]) / h, (moved[2] - state[2]) / h
+        # what the normal moves by when axis 1 turns, and axis 2: n × axis; sag changes that little
+        z0, z1, z2 = prepared[2], prepared[5], prepared[8]
+        x, y, u = -ca * prepared[OBLIQUE + 1], sa * prepared[OBLIQUE + 1], -prepared[OBLIQUE]
+        r0 = prepared[0] * x + prepared[1] * y + prepared[2] * u
+        r1 = prepared[3] * x + prepared[4] * y + prepared[5] * u
+        r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
+        a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
+        b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
         aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
         ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
         determinant = aa * bb - ab * ab
@@ -244,12 +281,7 @@ def _command_one(p, k, prepared, m, out, state, moved, wanted):
         best = np.nan
         for turn in (0, -1, 1):
             goal = angle + 2.0 * math.pi * turn
-            worm = 0.0
-            for _ in range(8):
-                worm = p[P.worm_1_sin_rad + 2 * a] * math.sin(k[K.worm_ratio + a] * (goal - worm)) + p[
-                    P.worm_1_cos_rad + 2 * a
-                ] * math.cos(k[K.worm_ratio + a] * (goal - worm))
-            count = _count_guess(a, goal - worm, p, k, prepared)
+            count = _count_guess(a, goal - _worm(p, k, a, goal), p, k, prepared)
             if k[K.lowest_count + a] <= count <= k[K.highest_count + a]:
                 best = count
                 break
@@ -271,11 +303,10 @@ def command_batch(p, k, row):
     for h in prange(len(p)):
         prepared = np.empty(N_PREPARED)
         state = np.empty(6)
-        moved = np.empty(6)
         wanted = np.empty(3)
-        _prepare(p[h], k[h], prepared)
+        prepare(p[h], k[h], prepared)
         for i in range(n):
-            status[h, i] = _command_one(p[h], k[h], prepared, row[h, i], out[h, i], state, moved, wanted)
+            status[h, i] = command_one(p[h], k[h], prepared, row[h, i], out[h, i], state, wanted)
     return out, status
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,31 @@ from rfpose.scenario import Scenario, check_scenario, load_scenario
 if TYPE_CHECKING:
     from rfpose.pipeline.track_file import Track
 
-__all__ = ["track"]
+__all__ = ["TrackChanges", "track"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackChanges:
+    """What a run takes instead of what stands in a scenario's ``[tracking]``; None: that.
+
+    Attributes
+    ----------
+    days, day_interval, sky
+        As the keys; ``sky`` is clear or bursts.
+    events
+        Happenings besides those of ``[[tracking.event]]``, with the same keys.
+    without_field_control
+        Track from the first second, without modes, messages and events.
+    """
+
+    days: int | None = None
+    day_interval: int | None = None
+    sky: str | None = None
+    events: Sequence[Mapping[str, Any]] = ()
+    without_field_control: bool = False
+
+
+_AS_IT_STANDS = TrackChanges()
 
 
 def track(
@@ -25,12 +50,8 @@ def track(
     result_path: str | Path,
     *,
     methods: Sequence[str] = (),
-    days: int | None = None,
-    day_interval: int | None = None,
+    changes: TrackChanges = _AS_IT_STANDS,
     heliostats: int | None = None,
-    sky: str | None = None,
-    events: Sequence[Mapping[str, Any]] = (),
-    without_field_control: bool = False,
     check_iq: Sequence[str] = (),
     seed: int = 0,
     force: bool = False,
@@ -48,16 +69,10 @@ def track(
         from there and gives the same bytes.
     methods
         Names; none: all that can steer the collector.
-    days, day_interval
-        Instead of those in ``[tracking]``.
+    changes
+        What differs from the scenario's ``[tracking]``.
     heliostats
         How many mirrors; see `rfpose.feedback.tracking.hidden.field_positions`.
-    sky
-        ``clear`` or ``bursts``, instead of that in ``[tracking]``.
-    events
-        Happenings besides those of ``[[tracking.event]]``, with the same keys.
-    without_field_control
-        Track from the first second, without modes, messages and events.
     check_iq
         Names of mirrors of which samples are made and processed, to see that the radio model holds.
     seed
@@ -81,9 +96,8 @@ def track(
     place = result_path.with_name(f".{result_path.name}.state")
     with claim(result_path, inputs=[scenario_path, place], force=force) as job:
         base = load_scenario(scenario_path)
-        changed = {"days": days, "day_interval": day_interval, "sky": sky}
         with _naming(scenario_path):
-            scenario = _with(base, events, without_field_control, changed)
+            scenario = _with(base, changes)
         records = {"wind": scenario.tracking.wind.record, "beam": scenario.tracking.beam_record}
         with claim(inputs=records.values()):  # none of the outputs may be one of them
             pass
@@ -130,20 +144,19 @@ def _naming(scenario_path: str | Path) -> Iterator[None]:
         raise ScenarioError(f"{scenario_path}: {error}") from error
 
 
-def _with(
-    scenario: Scenario, events: Sequence[Mapping[str, Any]], without_field_control: bool, changed: Mapping[str, Any]
-) -> Scenario:
-    """Return the scenario with some keys of ``[tracking]`` changed, None leaving one as it is, and with more events."""
-    values = {name: value for name, value in changed.items() if value is not None}
+def _with(scenario: Scenario, changes: TrackChanges) -> Scenario:
+    """Return the scenario with some keys of ``[tracking]`` changed."""
+    keys = {"days": changes.days, "day_interval": changes.day_interval, "sky": changes.sky}
+    values = {name: value for name, value in keys.items() if value is not None}
     data = scenario.model_dump(exclude_none=True)
     table = {**data["tracking"], **values}
     if values.get("sky") in ("clear", "bursts"):
         table.pop("beam_record", None)
-    if without_field_control:
-        if events:
+    if changes.without_field_control:
+        if changes.events:
             raise ScenarioError("events need field control to act on; leave out one or the other")
         table.pop("field_control", None)
         table["event"] = ()
-    elif events:
-        table["event"] = [*table.get("event", ()), *events]
+    elif changes.events:
+        table["event"] = [*table.get("event", ()), *changes.events]
     return check_scenario({**data, "tracking": table})

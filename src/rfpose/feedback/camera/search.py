@@ -10,11 +10,11 @@ import numpy as np
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Found", "neighbour_zones_m", "search", "spiral_offsets_m"]
+__all__ = ["SearchOutcome", "neighbour_zones_m", "search", "spiral_offsets_m"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
+class SearchOutcome:
     """How a search ended.
 
     Attributes
@@ -78,7 +78,7 @@ def neighbour_zones_m(width_m: float, height_m: float, *, last_seen_m: tuple[flo
     return np.asarray(ring * size)
 
 
-def search(look: Callable[[FloatArray], bool], offsets_m: FloatArray) -> Found:
+def search(look: Callable[[FloatArray], bool], offsets_m: FloatArray) -> SearchOutcome:
     """Move the aim along given offsets until the beam is in view.
 
     Parameters
@@ -90,5 +90,5 @@ def search(look: Callable[[FloatArray], bool], offsets_m: FloatArray) -> Found:
     """
     for i, offset in enumerate(offsets_m):
         if look(offset):
-            return Found(offset_m=offset, n_look=i + 1)
-    return Found(offset_m=np.full(2, np.nan), n_look=len(offsets_m))
+            return SearchOutcome(offset_m=offset, n_look=i + 1)
+    return SearchOutcome(offset_m=np.full(2, np.nan), n_look=len(offsets_m))

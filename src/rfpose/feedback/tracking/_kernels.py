@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.feedback._kernels import N_PREPARED, N_ROW, _axis, _bisector, _command_one, _posture, _prepare
+from rfpose.feedback._kernels import N_PREPARED, N_ROW, axis_angle, bisector, command_one, posture, prepare, stand
 from rfpose.feedback.columns import K, M, P
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers, law_step, stepper_step
 from rfpose.jit import kernel
@@ -262,6 +262,7 @@ class Workspace(NamedTuple):
     known: FloatArray
     guess: FloatArray
     true: FloatArray
+    still: FloatArray
     wanted: FloatArray
     hoped: FloatArray
     error: FloatArray
@@ -279,9 +280,9 @@ class Workspace(NamedTuple):
 def _workspace():
     """Make room to work in."""
     return Workspace(
-        np.empty(len(P)), np.empty(N_PREPARED), np.empty(N_PREPARED), np.empty(6), np.empty(6), np.empty(3),
-        np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty(2), np.empty(N_ROW), np.empty(N_ROW),
-        np.empty(N_ROW), np.empty((3, 6)),
+        np.empty(len(P)), np.empty(N_PREPARED), np.empty(N_PREPARED), np.empty(6), np.empty(6), np.empty(6),
+        np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty(2), np.empty(N_ROW),
+        np.empty(N_ROW), np.empty(N_ROW), np.empty(6),
     )  # fmt: skip
 
 
@@ -317,7 +318,7 @@ def _flatten(n, v):
 @kernel
 def _off(row, posture, wanted):
     """Angle between a normal and the one that the row wants from this mirror centre."""
-    _bisector(row, posture[3:], wanted)
+    bisector(row, posture[3:], wanted)
     total = 0.0
     for i in range(3):
         total += (wanted[i] - posture[i]) ** 2
@@ -327,7 +328,7 @@ def _off(row, posture, wanted):
 @kernel
 def _across(n, e, out):
     """Write what of ``e`` lies along the mirror's right and up, for a normal ``n``; return cos of the elevation."""
-    h = max(math.hypot(n[0], n[1]), 1e-9)
+    h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
     out[0] = (-n[1] * e[0] + n[0] * e[1]) / h
     out[1] = -(n[0] * e[0] + n[1] * e[1]) * n[2] / h + h * e[2]
     return max(h, _NEAR_ZENITH)
@@ -336,7 +337,7 @@ def _across(n, e, out):
 @kernel
 def _along(n, right, up, out):
     """Write the vector with these parts along the mirror's right and up."""
-    h = max(math.hypot(n[0], n[1]), 1e-9)
+    h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
     out[0] = (-n[1] * right - n[0] * n[2] * up) / h
     out[1] = (n[0] * right - n[1] * n[2] * up) / h
     out[2] = h * up
@@ -351,15 +352,15 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
     moved = np.empty(2)
     n = np.empty(3)
     d = np.empty(3)
-    _prepare(p, k, prepared)
-    _posture(_axis(0, count[0], p, k, prepared), _axis(1, count[1], p, k, prepared), p, prepared, 1.0, state)
+    prepare(p, k, prepared)
+    stand(count[0], count[1], p, k, prepared, 1.0, state)
     n[:] = state[:3]
     for f in range(nf):
         step = 1e-2 * scale[f]
         kept = p[free[f]]
         p[free[f]] = kept + step
-        _prepare(p, k, prepared)
-        _posture(_axis(0, count[0], p, k, prepared), _axis(1, count[1], p, k, prepared), p, prepared, 1.0, state)
+        prepare(p, k, prepared)
+        stand(count[0], count[1], p, k, prepared, 1.0, state)
         p[free[f]] = kept
         for i in range(3):
             d[i] = state[i] - n[i]
@@ -394,11 +395,11 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
                 value = cov[f, g] - (w0 * gain[g, 0] + w1 * gain[g, 1])
                 cov[f, g] = value
                 cov[g, f] = value
-    _prepare(p, k, prepared)
+    prepare(p, k, prepared)
 
 
 @kernel
-def _command(p, k, prepared, row, is_dish, sun, out, work):
+def _command(p, k, prepared, row, is_dish, sun, out, work, wanted):
     """Counts that send this sun to the row's target, or a dish to the sun; True where the mirror can reach them."""
     for i in range(3):
         row[M.source_enu + i] = sun[i]
@@ -406,7 +407,7 @@ def _command(p, k, prepared, row, is_dish, sun, out, work):
             row[M.target_enu + i] = sun[i]
     out[0] = np.nan
     out[1] = np.nan
-    return _command_one(p, k, prepared, row, out, work[0], work[1], work[2][:3]) == 0
+    return command_one(p, k, prepared, row, out, work, wanted) == 0
 
 
 @kernel
@@ -419,12 +420,12 @@ def _nearest_turn(near, k, counts):
 
 
 @kernel
-def _shifted(p, k, prepared, shift, counts, guess, row, work):
+def _shifted(p, k, prepared, shift, counts, guess, row, work, wanted):
     """Move counts so that the model's normal is turned by a small vector; True where the mirror can reach that."""
-    _posture(_axis(0, counts[0], p, k, prepared), _axis(1, counts[1], p, k, prepared), p, prepared, 0.0, guess)
+    stand(counts[0], counts[1], p, k, prepared, 0.0, guess)
     for i in range(3):
         row[M.source_enu + i] = row[M.target_enu + i] = guess[i] + shift[i]
-    return _command_one(p, k, prepared, row, counts, work[0], work[1], work[2][:3]) == 0
+    return command_one(p, k, prepared, row, counts, work, wanted) == 0
 
 
 @kernel
@@ -445,7 +446,7 @@ def _swing(loop, noise, rate_right, rate_up, state):
 @kernel
 def _bend(n, right, up):
     """Turn a normal by small angles."""
-    h = max(math.hypot(n[0], n[1]), 1e-9)
+    h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
     x, y, z = n[0], n[1], n[2]
     n[0] = x - right * y / h - up * x * z / h
     n[1] = y + right * x / h - up * y * z / h
@@ -481,9 +482,8 @@ def _track(h, first, end, tasks, stretch, room):
     keeps = stretch.courses.stored[h] >= 0
     trace = stretch.courses.trace[max(stretch.courses.stored[h], 0)]
     step0 = stretch.step0
-    p, prepared, known, guess, true, wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = (
-        room
-    )
+    p, prepared, known, guess, true, still = room[:6]
+    wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = room[6:]
     is_dish = target[3] > 0.5
     p[:] = built
     row[:] = 0.0
@@ -495,7 +495,10 @@ def _track(h, first, end, tasks, stretch, room):
     aside[:] = 0.0
     aside[M.sigma_rad] = 1.0  # a row whose light comes from and goes to one direction
     plate_up, plate_right = p[P.receiver_plane_up_rad], p[P.receiver_plane_right_rad]
-    _prepare(model, k, known)
+    prepare(model, k, known)
+    stood_1 = stood_2 = np.nan
+    axis_1 = axis_2 = 0.0
+    turned = True
     for s in range(first, end):
         g = step0 + s
         tick = g % loop.interval == 0
@@ -503,7 +506,8 @@ def _track(h, first, end, tasks, stretch, room):
             # wherever a stretch is cut, the same lean
             p[P.pedestal_tilt_north_rad] = built[P.pedestal_tilt_north_rad] + lean[0] * heat[s - s % 16]
             p[P.pedestal_tilt_east_rad] = built[P.pedestal_tilt_east_rad] + lean[1] * heat[s - s % 16]
-            _prepare(p, k, prepared)
+            prepare(p, k, prepared)
+            turned = True
         # where the model says the motors belong, now and one interval ahead
         if duty == GO:
             state[UNREACHABLE] = 0.0
@@ -520,7 +524,7 @@ def _track(h, first, end, tasks, stretch, room):
                 seen[:] = sun[s]
                 if math.isfinite(age[word]):
                     _carried(heard[word], loop.turn * (age[word] + s - first), loop, seen)
-                reached = _command(model, k, known, row, is_dish, seen, counts, work)
+                reached = _command(model, k, known, row, is_dish, seen, counts, work, wanted)
                 if reached:
                     _nearest_turn(state[NEXT] if fresh else state[MOTOR], k, counts)
                     state[NEXT], state[NEXT + 1] = counts[0], counts[1]
@@ -528,10 +532,10 @@ def _track(h, first, end, tasks, stretch, room):
             seen[:] = sun[s + ahead]
             if math.isfinite(age[word]):
                 _carried(heard[word], loop.turn * (age[word] + s - first + ahead), loop, seen)
-            reached = _command(model, k, known, row, is_dish, seen, counts, work) and reached
+            reached = _command(model, k, known, row, is_dish, seen, counts, work, wanted) and reached
             shift = state[SHIFT : SHIFT + 3]
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
-                reached = _shifted(model, k, known, shift, counts, guess, aside, work)
+                reached = _shifted(model, k, known, shift, counts, guess, aside, work, wanted)
             # from where the motor is: near the zenith commands swing faster than it can follow
             _nearest_turn(state[COMMAND] if fresh else state[MOTOR], k, counts)
             if reached:
@@ -567,10 +571,7 @@ def _track(h, first, end, tasks, stretch, room):
                     for a in range(2 if not busy else 0):
                         state[SLIP + a] += seconds * law.gain * entry[1 + a]
                 elif not busy:  # out of reach, or with a motor flat out on its way: nothing winds up meanwhile
-                    _posture(
-                        _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model,
-                        known, 0.0, guess,
-                    )  # fmt: skip
+                    stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
                     for i in range(3):
                         speed, state[RAMP + i] = law_step(entry[1 + i], state[RAMP + i], law, seconds)
                         change[i] = state[SHIFT + i]
@@ -601,10 +602,7 @@ def _track(h, first, end, tasks, stretch, room):
                 m = state[LEARNED]
                 across[0], across[1] = state[INNOVATION] / m, state[INNOVATION + 1] / m
                 own = 0.5 * (spread[0] * spread[0] + spread[1] * spread[1] + spread[2] * spread[2])
-                _posture(
-                    _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known,
-                    0.0, guess,
-                )  # fmt: skip
+                stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
                 for i in range(3):
                     state[SHIFT + i] -= guess[i]
                 _learn(
@@ -612,10 +610,7 @@ def _track(h, first, end, tasks, stretch, room):
                     known, guess,
                 )  # fmt: skip
                 # what the model has learned comes off the shift, so that the mirror does not jump
-                _posture(
-                    _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known,
-                    0.0, guess,
-                )  # fmt: skip
+                stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
                 for i in range(3):
                     state[SHIFT + i] += guess[i]
                 state[LEARNED] = state[INNOVATION] = state[INNOVATION + 1] = 0.0
@@ -638,13 +633,22 @@ def _track(h, first, end, tasks, stretch, room):
                 total[STARTS] += 1.0
             state[MOVED + a] = move
         # where the mirror really points
-        axis_1 = _axis(0, state[AXIS], p, k, prepared)
-        axis_2 = _axis(1, state[AXIS + 1], p, k, prepared)
-        _posture(axis_1, axis_2, p, prepared, 0.0, true)
+        if state[AXIS] != stood_1:
+            stood_1 = state[AXIS]
+            axis_1 = axis_angle(0, stood_1, p, k, prepared)
+            turned = True
+        if state[AXIS + 1] != stood_2:
+            stood_2 = state[AXIS + 1]
+            axis_2 = axis_angle(1, stood_2, p, k, prepared)
+            turned = True
+        if turned:  # in most seconds no motor takes a step
+            posture(axis_1, axis_2, p, prepared, 0.0, still)
+            turned = False
+        true[:] = still
         push = mean_speed * mean_speed + 2.0 * mean_speed * gust[s]
         right, up = bend[0] * push, bend[1] * push
         if loop.swings:
-            _swing(loop, swing[s], -math.hypot(true[0], true[1]) * change[0], change[1], state)
+            _swing(loop, swing[s], -math.sqrt(true[0] * true[0] + true[1] * true[1]) * change[0], change[1], state)
             right += state[SWING]
             up += state[SWING + 2]
         _bend(true, right, up)
@@ -686,11 +690,11 @@ def _track(h, first, end, tasks, stretch, room):
                     beam = 0.0
                     length = 0.0
                     for i in range(3):
-                        work[0, i] = target[i] - true[3 + i]
-                        length += work[0, i] ** 2
+                        work[i] = target[i] - true[3 + i]
+                        length += work[i] ** 2
                     length = math.sqrt(length)
                     for i in range(3):
-                        beam += (2.0 * facing * true[i] - sun[s, i] - work[0, i] / length) ** 2
+                        beam += (2.0 * facing * true[i] - sun[s, i] - work[i] / length) ** 2
                     beam = math.sqrt(beam)
                 total[STEPS] += 1.0
                 total[SQUARE] += angle * angle
@@ -737,10 +741,7 @@ def _track(h, first, end, tasks, stretch, room):
         # flat out a mirror is somewhere on its way: that is nothing to steer by or to learn from
         slewing = abs(state[MOVED]) >= 0.999 * drive_1.speed or abs(state[MOVED + 1]) >= 0.999 * drive_2.speed
         entry[0] = HEARD if duty == GO or slewing else USED
-        _posture(
-            _axis(0, state[MOTOR], model, k, known), _axis(1, state[MOTOR + 1], model, k, known), model, known, 0.0,
-            guess,
-        )  # fmt: skip
+        stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
         if loop.feedback == RADIO:
             if settled:
                 total[FRAMES] += 1.0
@@ -770,7 +771,7 @@ def _track(h, first, end, tasks, stretch, room):
             _across(true, error, across)
             entry[4] = across[0] + right
             entry[5] = across[1] + up
-            _bisector(row, guess[3:], hoped)
+            bisector(row, guess[3:], hoped)
             for i in range(3):
                 error[i] = hoped[i] - true[i]
             _across(true, error, across)
@@ -779,7 +780,7 @@ def _track(h, first, end, tasks, stretch, room):
             for a in range(2):
                 here = (axis_1 if a == 0 else axis_2) - p[P.axis_1_zero_rad + a]
                 read = math.floor(here / loop.level + 0.5) * loop.level
-                entry[1 + a] = _axis(a, state[COMMAND + a], model, k, known) - read
+                entry[1 + a] = axis_angle(a, state[COMMAND + a], model, k, known) - read
         else:
             for i in range(3):
                 error[i] = sun[s, i] - true[i]

@@ -5,8 +5,7 @@ An error of a look is that of the mirror's normal, to its right and up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,29 +30,14 @@ _N_RADIO = 6
 
 
 class Instrument(Protocol):
-    """Something that looks at all mirrors of a plant.
+    """Something that looks at all mirrors of a plant."""
 
-    Attributes
-    ----------
-    target_enu_m : (mirror, xyz)
-        Where mirrors send the sun while it looks [m].
-    sees_spots
-        It sees where the light goes, and not the normal.
-    sees_receiver_plane
-        Its normals are those of the receivers' plane, not the mirror's.
-    """
-
-    @property
-    def target_enu_m(self) -> FloatArray:
-        """See above."""
-
-    @property
-    def sees_spots(self) -> bool:
-        """See above."""
-
-    @property
-    def sees_receiver_plane(self) -> bool:
-        """See above."""
+    target_enu_m: FloatArray
+    """(mirror, xyz) where mirrors send the sun while it looks [m]."""
+    sees_spots: bool
+    """It sees where the light goes, and not the normal."""
+    sees_receiver_plane: bool
+    """Its normals are those of the receivers' plane, not the mirror's."""
 
     def draw(self, looks: Postures, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return errors of looks (mirror, look, 2), constant ones included, and the sigma told of them [rad]."""
@@ -156,20 +140,13 @@ class DroneFlights:
         return np.full((len(self._field), 2), self._constant_sigma_rad**2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RadioVariance:
-    """What to expect of radio normals over some postures: (mirror, 2), right and up [rad²].
+class RadioVariance(NamedTuple):
+    """What to expect of radio normals over some postures, right and up (mirror, 2) [rad²]."""
 
-    Attributes
-    ----------
-    noise
-        Variance of a frame.
-    bias
-        Square of what a reflection does that is not in the pose solver's model.
-    """
-
-    noise: FloatArray = field(repr=False)
-    bias: FloatArray = field(repr=False)
+    noise: FloatArray
+    """Variance of a frame."""
+    bias: FloatArray
+    """Square of what a reflection does that is not in the pose solver's model."""
 
 
 class RadioPoses:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,7 @@ class Simulation:
         kept = Kept(stored=self.stored, stride=self._stride)
         self._runs = {m.name: MethodRun(m, self.plant, calibrator, kept) for m in self.methods}
         self._gust_state = self.plant.gusts.process.start(generator(self.plant.seed, 1, 0), n)
+        self._beside = ThreadPoolExecutor(1, "rfpose-wind")
         self.done = 0
         self.plant.check_reach()
 
@@ -140,7 +142,9 @@ class Simulation:
         n_step = segment.end - segment.first
         n_frame = -(-n_step // round(plan.control_interval_s / plan.servo_interval_s))
         place = (segment.i_day, segment.first)
-        gust = plant.gusts.run(self._gust_state, generator(plant.seed, 2, *place), day.unix_s[steps])
+        # wind has random numbers of its own, and can be drawn beside the others
+        wind = generator(plant.seed, 2, *place)
+        gust = self._beside.submit(plant.gusts.run, self._gust_state, wind, day.unix_s[steps])
         rng = generator(plant.seed, 3, *place)
         noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
         lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
@@ -151,7 +155,7 @@ class Simulation:
             lost[~errors.solved] = 1
         return Draws(
             mean_mps=plant.gusts.mean_mps,
-            gust=gust,
+            gust=gust.result(),
             swing=plant.gusts.draw_swing(rng, (n, n_step)),
             noise=noise,
             lost=lost,
