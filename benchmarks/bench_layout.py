@@ -14,8 +14,9 @@ import numba
 import numpy as np
 
 from rfpose.layout import maps
-from rfpose.layout.maps import ESTIMATORS, Mirrors, Noise
+from rfpose.layout.maps import ESTIMATORS, Mirrors
 from rfpose.layout.optimise import CRITERIA, Constraints, Zone, evaluate_placement, optimise
+from rfpose.measurement import Noise
 from rfpose.pipeline.bench_multilat import TRANSMITTER_ENU_M
 
 PLACES = np.array([[0.9988, 0.0, 0.0], [-0.4994, 0.865, 0.0], [-0.4994, -0.865, 0.0]])

@@ -16,6 +16,7 @@ from rfpose.geometry import enu_from_azimuth_elevation
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
+from rfpose.measurement import noise_of
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.layout import Rules, budget_layout, map_layout, optimise_layout
 from rfpose.pipeline.layout.site import Postures
@@ -159,7 +160,7 @@ def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
     mirrors = maps.mirrors_of(scenario, sun_enu=sun)
     seen = visible(scenario.transmitter_enu_m, mirrors, Plates(width_m=4.0, height_m=4.0))
     bound = maps.normal_map(
-        scenario.transmitter_enu_m, mirrors, maps.noise_of(scenario), ESTIMATORS["shared-clock"], visible=seen
+        scenario.transmitter_enu_m, mirrors, noise_of(scenario), ESTIMATORS["shared-clock"], visible=seen
     )
     assert 0 < (~seen).sum() < seen.size
     sight = found["line_of_sight"]
@@ -170,7 +171,7 @@ def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
     masked = seen.copy()
     masked[..., 3] = False
     without = maps.normal_map(
-        scenario.transmitter_enu_m, mirrors, maps.noise_of(scenario), ESTIMATORS["shared-clock"], visible=masked
+        scenario.transmitter_enu_m, mirrors, noise_of(scenario), ESTIMATORS["shared-clock"], visible=masked
     )
     lost = found["normal_without_transmitter_mrad"]["shared-clock"][scenario.transmitter_ids[3]]
     assert lost == pytest.approx(1e3 * np.sqrt(np.nanmean(without**2)), rel=1e-6)
@@ -188,7 +189,8 @@ def test_map_with_the_reflection_estimated(tmp_path):
     budget = budget_layout(site, ground="estimated", n_draw=0).as_dict()["lines"]
     noise = ("thermal noise", "quantisation", "calibration noise")
     total = np.sqrt(sum(line["normal_mrad"] ** 2 for line in budget if line["source"] in noise))
-    assert found["reflection"]["rms"] == pytest.approx(total)
+    # the calibration's noise is common to mirrors, and what the solver states takes it for each one's own
+    assert found["reflection"]["rms"] == pytest.approx(total, rel=3e-3)
     # the ground is one more unknown and one more look at the mirror: of the same order as without it
     assert 0.3 < found["reflection"]["rms"] / found["delays"]["rms"] < 30.0
 

@@ -6,8 +6,9 @@ import pytest
 from rfpose.errors import InvalidInputError
 from rfpose.layout import maps
 from rfpose.layout.gain import Reflection, gain_of, normal_gain
-from rfpose.layout.maps import ESTIMATORS, Estimator, Noise, mirrors_facing, normal_map
+from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.layout.sensitivity import transmitter_sensitivity
+from rfpose.measurement import Estimator, Noise
 from rfpose.multilat.rigid import Knowledge, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
@@ -55,10 +56,11 @@ def test_squares_of_the_gain_are_the_map(mirrors, estimator, calibration, range_
     if np.isfinite(estimator.pivot_sigma_m):
         variance += (slope.pivot_slope**2).sum(axis=(1, 2)) * estimator.pivot_sigma_m**2
     if estimator.clock_sigma_m > 0.0 and np.isfinite(estimator.clock_sigma_m):
-        for groups in (slice(0, 2), slice(2, 3)):
-            by_clock = slope.range_slope[:, :, groups].sum(axis=(2, 4))
+        for g in range(len(own)):
+            by_clock = slope.range_slope[:, :, g].sum(axis=3)
             variance += (by_clock**2).sum(axis=(1, 2)) * estimator.clock_sigma_m**2
     np.testing.assert_allclose(np.sqrt(variance), normal_map(TRANSMITTER, mirrors, plan, estimator), rtol=1e-10)
+    np.testing.assert_allclose(np.trace(slope.cov, axis1=1, axis2=2), variance, rtol=1e-10)
 
 
 def solved(mirrors, transmitter, ranges, estimator):

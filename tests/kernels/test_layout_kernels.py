@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from rfpose.layout import maps
-from rfpose.layout.maps import ESTIMATORS, Estimator, Noise, dilution, mirrors_facing, normal_map
+from rfpose.layout.maps import ESTIMATORS, dilution, mirrors_facing, normal_map
 from rfpose.layout.optimise import CRITERIA
 from rfpose.layout.optimise.search import _rows
+from rfpose.measurement import Estimator, Noise
 from rfpose.multilat import dop, normal_bound, position_bound
 from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
@@ -76,11 +77,9 @@ def test_rigid_bound(mirrors, estimator, known, n_tone, calibration):
     plan = noise(calibration, n_tone, carrier=1e-4)
     sigma = np.repeat(plan.tone_sigma_m[:, None], 3, axis=1)
     common = plan.calibration_sigma_m
-    group_class = [0] * n_tone
     if estimator.carrier:
         sigma = np.concatenate([sigma, np.full((1, 3, 10), 1e-4)])
         common = np.concatenate([common, np.full((1, 10), np.inf)])
-        group_class += [1]
     cov = rigid_bound(
         TRANSMITTER,
         mirrors.receiver_mirror_m,
@@ -88,7 +87,7 @@ def test_rigid_bound(mirrors, estimator, known, n_tone, calibration):
         mirrors.rot_enu_from_mirror,
         sigma_m=np.repeat(sigma[None], N, axis=0),
         transmitter_sigma_m=common,
-        clock_class=group_class,
+        clock_class=np.arange(len(sigma)),
         knowledge=Knowledge(pivot_enu_m=mirrors.pivot_enu_m, **known),
     )
     got = normal_map(TRANSMITTER, mirrors, plan, estimator)

@@ -143,6 +143,12 @@ class TonePhases:
     clipped_fraction: FloatArray
     status: npt.NDArray[np.uint8]
 
+    @property
+    def carrier_sigma_rad(self) -> FloatArray:
+        """(frame, receiver, transmitter) standard deviation of the carriers' phases [rad]."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self.carrier_sigma / np.abs(self.carrier))
+
     @classmethod
     def empty(
         cls,

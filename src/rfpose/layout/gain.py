@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
-from rfpose.layout.maps import Estimator, Mirrors, Noise, _groups, _plane_slope
+from rfpose.layout.maps import Mirrors, _plane_slope
+from rfpose.measurement import Estimator, Noise, clock_classes
 
 __all__ = ["Gain", "Reflection", "gain_of", "normal_gain"]
 
@@ -40,6 +41,8 @@ class Gain:
         What each range does to the shared unknowns [1/m].
     shared_pivot_slope : (mirror, shared, xyz)
         What each pivot's survey does to them [1/m].
+    cov : (mirror, xy, xy)
+        Of the normal's error as the solver itself will state it: noise and priors as it assumes them [rad²].
     """
 
     range_slope: FloatArray
@@ -47,6 +50,7 @@ class Gain:
     shared_slope: FloatArray
     shared_range_slope: FloatArray
     shared_pivot_slope: FloatArray
+    cov: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,15 +88,9 @@ def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, es
         Shapes that do not fit; an estimator that needs the carrier where ``noise`` has none.
     """
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    weight, bias_info, group_class = _groups(noise, estimator)
-    own = np.broadcast_to(weight[:, None] ** -0.5, (len(weight), mirrors.receiver_mirror_m.shape[1], len(transmitter)))
-    sigma = np.broadcast_to(own, (len(mirrors.pivot_enu_m), *own.shape))
-    if noise.reference_range_m is not None:
-        distance = np.linalg.norm(mirrors.receiver_enu_m[:, :, None] - transmitter, axis=-1)
-        sigma = sigma * distance[:, None] / noise.reference_range_m
-    with np.errstate(divide="ignore"):
-        common = bias_info**-0.5
-    return normal_gain(transmitter, mirrors, sigma, common, group_class, estimator)
+    own, common = noise.groups(carrier=estimator.carrier)
+    sigma = own[:, None] * noise.loss(transmitter, mirrors.receiver_enu_m)[:, None]
+    return normal_gain(transmitter, mirrors, sigma, common, clock_classes(len(own)), estimator)
 
 
 def normal_gain(
@@ -152,11 +150,12 @@ def normal_gain(
         if reflection is not None:
             bent = Reflection(place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows])
         parts.append(_rigid(transmitter, part, sigma[rows], common, classes, estimator, bent))
-    range_slope, pivot_slope, shared_slope, by_range, by_pivot, schur = (
+    range_slope, pivot_slope, cov, shared_slope, by_range, by_pivot, schur = (
         np.concatenate(arrays) for arrays in zip(*parts, strict=True)
     )
     if shared_slope.shape[2]:
         inverse = np.linalg.inv(schur.sum(axis=0))
+        cov = cov + shared_slope @ inverse @ np.swapaxes(shared_slope, 1, 2)
         by_range, by_pivot = (
             np.einsum("pq,mqgrt->mpgrt", inverse, by_range),
             np.einsum("pq,mqx->mpx", inverse, by_pivot),
@@ -167,6 +166,7 @@ def normal_gain(
         shared_slope=shared_slope,
         shared_range_slope=by_range,
         shared_pivot_slope=by_pivot,
+        cov=cov,
     )
 
 
@@ -200,7 +200,12 @@ def _independent(
     slope = np.broadcast_to(_plane_slope(mirrors.receiver_mirror_m), (n_mirror, n_receiver, 3, 3))[:, :, :2]
     by_place = np.einsum("mrkc,mac->mrka", slope, mirrors.rot_enu_from_mirror)
     out = np.einsum("mrka,mrab,mgrtb->mkgrt", by_place, place_gain, rows)
-    return out, np.zeros((n_mirror, 2, 3)), *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
+    # a receiver that is located by itself takes what is common to all of a mirror's for noise of its own; the normal's
+    # covariance does not
+    together = out.sum(axis=3)
+    cov = np.einsum("mkgrt,mgrt,mlgrt->mkl", out, sigma**2, out)
+    cov = cov + np.einsum("mkgt,gt,mlgt->mkl", together, common**2, together)
+    return out, np.zeros((n_mirror, 2, 3)), cov, *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
 
 
 def _nothing_shared(n_mirror: int, n_group: int, n_receiver: int, n_transmitter: int) -> tuple[FloatArray, ...]:
@@ -251,16 +256,16 @@ def _rigid(
     solve = to_normal @ pose
     out = (solve @ np.swapaxes(flat[:, :, :n_pose], 1, 2)).reshape(n_mirror, 2, *sigma.shape[1:])
     pivot_info = estimator.pivot_sigma_m**-2.0
-    pivot = solve[:, :, :3] * pivot_info
+    pivot, cov = solve[:, :, :3] * pivot_info, solve @ np.swapaxes(to_normal, 1, 2)
     if not n_shared:
-        return out, pivot, *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
+        return out, pivot, cov, *_nothing_shared(n_mirror, n_group, n_receiver, n_transmitter)
     cross = info[:, n_pose:, :n_pose]
     follow = cross @ pose
     by_range = np.swapaxes(flat[:, :, n_pose:] - flat[:, :, :n_pose] @ np.swapaxes(follow, 1, 2), 1, 2)
     schur = info[:, n_pose:, n_pose:] - follow @ np.swapaxes(cross, 1, 2)
     shared = -solve @ np.swapaxes(cross, 1, 2)
     by_range = by_range.reshape(n_mirror, n_shared, *sigma.shape[1:])
-    return out, pivot, shared, by_range, -follow[:, :, :3] * pivot_info, schur
+    return out, pivot, cov, shared, by_range, -follow[:, :, :3] * pivot_info, schur
 
 
 def _clock_columns(classes: npt.NDArray[np.int64], n_receiver: int, *, shared: bool) -> FloatArray:

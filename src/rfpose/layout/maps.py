@@ -13,30 +13,24 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose import geometry
-from rfpose.checks import FloatArray, as_float_array, read_only
-from rfpose.dsp.bounds import phase_bound_rad
+from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.jit import load_numba
 from rfpose.layout import _kernels
+from rfpose.measurement import SCENARIO, Estimator, Noise, clock_classes, estimators_of, noise_of
 from rfpose.scenario import Heliostat, Scenario
 
 __all__ = [
     "ESTIMATORS",
-    "SCENARIO",
     "Dilution",
-    "Estimator",
     "Mirrors",
-    "Noise",
     "Study",
     "check_site",
     "dilution",
     "disc_points",
-    "estimator_of",
-    "estimators_of",
     "in_words",
     "mirrors_facing",
     "mirrors_of",
-    "noise_of",
     "normal_map",
     "normal_without_each",
     "posture_name",
@@ -46,55 +40,11 @@ __all__ = [
 
 IndexArray = npt.NDArray[np.int64]
 
-_MAX_DB = 300.0
 _COINCIDENT_M = 1e-6
 _FLAT = 1e-6
 """Extent of the transmitters across a line or plane, as a share of their largest, below which they lie in it."""
 _MIN_TRANSMITTER = {2: 4, 3: 5}
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimator:
-    """How normals are made of phases, and what is known besides.
-
-    Attributes
-    ----------
-    name
-        For tables and pictures.
-    rigid
-        All receivers of a mirror in one fit; else each by itself and the plane through them.
-    clock_sigma_m
-        Of each receiver's delay about the mirror's common clock: 0 one shared clock, infinity one a receiver [m].
-    carrier
-        Use the carrier's phase between a mirror's receivers, too (integers known).
-    pivot_sigma_m
-        Survey of the pivot in each axis; infinity: unknown [m].
-    two_axis, roll_sigma_rad
-        An azimuth-elevation mount keeps the mirror's x axis horizontal this well.
-    clock_a_tone
-        Each tone has clocks of its own, since filters delay tones differently; else all tones have them in common.
-    """
-
-    name: str
-    rigid: bool = True
-    clock_sigma_m: float = np.inf
-    carrier: bool = False
-    pivot_sigma_m: float = np.inf
-    two_axis: bool = False
-    roll_sigma_rad: float = 1e-6
-    clock_a_tone: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.clock_sigma_m >= 0.0:
-            raise InvalidInputError(f"`clock_sigma_m` must not be negative, got {self.clock_sigma_m}")
-        if not self.pivot_sigma_m > 0.0:
-            raise InvalidInputError(f"`pivot_sigma_m` must be greater than zero, got {self.pivot_sigma_m}")
-        if not self.roll_sigma_rad > 0.0:
-            raise InvalidInputError(f"`roll_sigma_rad` must be greater than zero, got {self.roll_sigma_rad}")
-
-
-SCENARIO = "scenario"
-"""Name of the estimator that a scenario describes; see `estimator_of`."""
 
 ESTIMATORS = {
     e.name: e
@@ -109,39 +59,6 @@ ESTIMATORS = {
 }
 """Ready estimators; ``delays`` compares carriers with each receiver's delay estimated in every frame, ``pivot`` has
 pivots surveyed to 5 mm and a shared clock."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Noise:
-    """Range noise of the tones and of the carrier; arrays are read-only.
-
-    Attributes
-    ----------
-    tone_sigma_m : (tone, transmitter)
-        A receiver's own noise of one transmitter's range, at ``reference_range_m`` if that is given [m].
-    calibration_sigma_m : (tone, transmitter)
-        Of the transmitter phases, the same for all receivers of a frame [m].
-    carrier_sigma_m : (transmitter,) or None
-        Own noise of the carrier's phase as a range [m].
-    reference_range_m
-        Noise grows with range over this (free space); None: noise is the same everywhere.
-    """
-
-    tone_sigma_m: FloatArray
-    calibration_sigma_m: FloatArray
-    carrier_sigma_m: FloatArray | None = None
-    reference_range_m: float | None = None
-
-    @classmethod
-    def uniform(cls, n_transmitter: int, sigma_m: float = 1.0, calibration_sigma_m: float = 0.0) -> Noise:
-        """Return one tone, all transmitters alike."""
-        if not sigma_m > 0.0 or calibration_sigma_m < 0.0:
-            raise InvalidInputError("`sigma_m` must be greater than zero and `calibration_sigma_m` not negative")
-        shape = (1, n_transmitter)
-        return cls(
-            tone_sigma_m=read_only(np.full(shape, float(sigma_m))),
-            calibration_sigma_m=read_only(np.full(shape, float(calibration_sigma_m))),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -374,20 +291,20 @@ def normal_map(
         return np.asarray(np.sqrt(out))
     shared = estimator.clock_sigma_m == 0.0
     roll_info = estimator.roll_sigma_rad**-2 if estimator.two_axis else 0.0
-    one_clock = not (estimator.clock_a_tone and len(noise.tone_sigma_m) > 1)
-    calibrated = one_clock and not estimator.carrier and not np.any(noise.calibration_sigma_m > 0.0)
-    if calibrated and (shared or np.isinf(estimator.clock_sigma_m)):
+    own, common = noise.groups(carrier=estimator.carrier)
+    if len(own) == 1 and not np.any(common > 0.0) and (shared or np.isinf(estimator.clock_sigma_m)):
         _kernels.tilt_calibrated(
-            field_seen, (noise.tone_sigma_m**-2.0).sum(axis=0), shared, estimator.pivot_sigma_m**-2, roll_info,
-            _chunks(n_mirror), out,
+            field_seen, own[0] ** -2.0, shared, estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
-    weight, bias_info, group_class = _groups(noise, estimator)
+    with np.errstate(divide="ignore"):
+        bias_info = common**-2.0
+    group_class = clock_classes(len(own))
     tie = 0.0
     if not shared and np.isfinite(estimator.clock_sigma_m):
         tie = 1.0 / (n_receiver * estimator.clock_sigma_m**2)
     _kernels.tilt_rigid(
-        field_seen, weight, bias_info, group_class, int(group_class[-1]) + 1, shared, tie,
+        field_seen, own**-2.0, bias_info, group_class, len(own), shared, tie,
         estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
     )  # fmt: skip
     return np.asarray(np.sqrt(out))
@@ -406,24 +323,6 @@ def _field(
         rot=mirrors.rot_enu_from_mirror,
         range2=range2,
         visible=seen,
-    )
-
-
-def _groups(noise: Noise, estimator: Estimator) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
-    """Own weights and transmitters' information (group, transmitter), clock class (group,): tones, then carrier."""
-    weight = noise.tone_sigma_m**-2.0
-    with np.errstate(divide="ignore"):
-        bias_info = noise.calibration_sigma_m**-2.0
-    group_class = np.arange(len(weight)) if estimator.clock_a_tone else np.zeros(len(weight), np.int64)
-    if not estimator.carrier:
-        return weight, bias_info, group_class
-    if noise.carrier_sigma_m is None:
-        raise InvalidInputError(f"`noise` must hold the carrier's for estimator `{estimator.name}`")
-    carrier = noise.carrier_sigma_m[None] ** -2.0
-    return (
-        np.concatenate([weight, carrier]),
-        np.concatenate([bias_info, np.zeros_like(carrier)]),
-        np.append(group_class, group_class[-1] + 1),
     )
 
 
@@ -461,15 +360,8 @@ def normal_without_each(
     rows = []
     for lost in range(len(transmitter)):
         left = np.arange(len(transmitter)) != lost
-        carrier = noise.carrier_sigma_m
-        fewer = Noise(
-            tone_sigma_m=np.ascontiguousarray(noise.tone_sigma_m[:, left]),
-            calibration_sigma_m=np.ascontiguousarray(noise.calibration_sigma_m[:, left]),
-            carrier_sigma_m=None if carrier is None else np.ascontiguousarray(carrier[left]),
-            reference_range_m=noise.reference_range_m,
-        )
         rest = None if seen is None else seen[..., left]
-        rows.append(normal_map(transmitter[left], mirrors, fewer, estimator, visible=rest))
+        rows.append(normal_map(transmitter[left], mirrors, noise.without(lost), estimator, visible=rest))
     return np.array(rows)
 
 
@@ -572,32 +464,6 @@ def posture_name(scenario: Scenario) -> str:
     return "level" if scenario.simulated_sun_enu is None else "simulated sun"
 
 
-def estimator_of(scenario: Scenario, heliostat: Heliostat) -> Estimator:
-    """Return how `rfpose process` makes a heliostat's normal by pose rigid: its clocks, carrier, pivot and mount.
-
-    Reflections, and delays that are learned over frames, are not in it.
-    """
-    clock = np.inf
-    if heliostat.oscillator == "shared" and heliostat.receiver_delay_sigma_s is not None:
-        clock = heliostat.receiver_delay_sigma_s * scenario.radio.propagation_speed_mps
-    return Estimator(
-        name=SCENARIO,
-        clock_sigma_m=clock,
-        carrier=scenario.compares_carriers(heliostat),
-        pivot_sigma_m=np.inf if heliostat.pivot_sigma_m is None else heliostat.pivot_sigma_m,
-        two_axis=heliostat.mount == "azimuth_elevation",
-        clock_a_tone=True,
-    )
-
-
-def estimators_of(scenario: Scenario, heliostats: Sequence[Heliostat] | None = None) -> dict[Estimator, IndexArray]:
-    """Return the scenario's own estimators, and which of its (or of these) heliostats each is for."""
-    found: dict[Estimator, list[int]] = {}
-    for i, heliostat in enumerate(scenario.heliostat if heliostats is None else heliostats):
-        found.setdefault(estimator_of(scenario, heliostat), []).append(i)
-    return {estimator: np.array(rows, np.int64) for estimator, rows in found.items()}
-
-
 def study_of(
     scenario: Scenario,
     name: str,
@@ -618,20 +484,18 @@ def study_of(
     """
     heliostats = scenario.heliostat if heliostats is None else heliostats
     noise = noise_of(scenario, tone_snr_db=tone_snr_db)
-    if name == SCENARIO:
+    rows = estimators_of(scenario, heliostats)
+    if name != SCENARIO:
+        estimator = ESTIMATORS[name]
+        if estimator.carrier and not scenario.has_rf_carriers:
+            raise GeometryError(
+                f"estimator `{name}` compares carriers, and not all of their radio frequencies are above zero: set "
+                "`radio.centre_frequency_hz`, or choose another estimator"
+            )
+        rows = {estimator: np.arange(len(heliostats))}
         if not scenario.calibration_receiver:
-            noise = replace(noise, calibration_sigma_m=read_only(np.full_like(noise.tone_sigma_m, np.inf)))
-        return Study(
-            transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows=estimators_of(scenario, heliostats)
-        )
-    estimator = ESTIMATORS[name]
-    if estimator.carrier and not scenario.has_rf_carriers:
-        raise GeometryError(
-            f"estimator `{name}` compares carriers, and not all of their radio frequencies are above zero: set "
-            "`radio.centre_frequency_hz`, or choose another estimator"
-        )
-    everything = np.arange(len(heliostats))
-    return Study(transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows={estimator: everything})
+            noise = replace(noise, calibration_sigma_m=np.zeros_like(noise.tone_sigma_m))
+    return Study(transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows=rows)
 
 
 def in_words(estimator: Estimator, propagation_speed_mps: float) -> str:
@@ -666,49 +530,6 @@ def check_clear(scenario: Scenario) -> None:
             f"heliostat `{scenario.heliostat_ids[nearest[t]]}` and transmitter `{scenario.transmitter_ids[t]}` stand "
             "at the same place; move one"
         )
-
-
-def noise_of(scenario: Scenario, *, tone_snr_db: float | None = None) -> Noise:
-    """Return the noise that a scenario's radio plan allows: each phase at its Cramér–Rao bound.
-
-    Tones: σ_φ = 1/√(n·snr), snr = (a m)²/σ² as `[simulation] tone_snr_db` counts it. Carrier: σ = 1/√(2n)·σ/a.
-    Calibration: all calibration receivers, weighed by their noise and the survey of their places.
-
-    Parameters
-    ----------
-    scenario
-        With ``[simulation] path_loss = "free_space"``, noise grows with range.
-    tone_snr_db
-        Overrides ``[simulation] tone_snr_db``.
-    """
-    plan = scenario.simulation
-    if tone_snr_db is not None and not abs(tone_snr_db) <= _MAX_DB:
-        raise InvalidInputError(f"`--snr` must be a number of decibels within ±{_MAX_DB:g}, got {tone_snr_db}")
-    snr_first = 10.0 ** ((plan.tone_snr_db if tone_snr_db is None else tone_snr_db) / 10.0)
-    index = np.array([t.modulation_index for t in scenario.tone])
-    amplitude = np.array([t.amplitude for t in scenario.transmitter])
-    snr = snr_first * (index[:, None] / index[0] * amplitude) ** 2
-    n_sample = scenario.radio.frame_samples
-    tone = scenario.wavelength_m[:, None] / (2.0 * np.pi) * phase_bound_rad(n_sample, snr)
-    carrier_snr = 2.0 * snr_first * (amplitude / index[0]) ** 2
-    carrier = None
-    if scenario.has_rf_carriers:
-        per_rad = scenario.radio.propagation_speed_mps / (2.0 * np.pi * scenario.carrier_rf_hz)
-        carrier = per_rad * phase_bound_rad(n_sample, carrier_snr)
-    free = plan.path_loss == "free_space"
-    calibration = np.zeros_like(tone)
-    if scenario.calibration_receiver:
-        distance = np.linalg.norm(scenario.calibration_enu_m[:, None] - scenario.transmitter_enu_m, axis=2)
-        loss = distance / plan.reference_range_m if free else np.ones_like(distance)
-        survey = np.array([r.survey_sigma_m for r in scenario.calibration_receiver])
-        variance = (tone[:, None] * loss) ** 2 + survey[:, None] ** 2
-        calibration = (variance**-1.0).sum(axis=1) ** -0.5
-    return Noise(
-        tone_sigma_m=read_only(tone),
-        calibration_sigma_m=read_only(calibration),
-        carrier_sigma_m=carrier,
-        reference_range_m=plan.reference_range_m if free else None,
-    )
 
 
 def summarise(values: FloatArray) -> dict[str, float]:

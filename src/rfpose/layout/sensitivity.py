@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.layout.gain import gain_of
-from rfpose.layout.maps import Estimator, Mirrors, Noise, normal_map, normal_without_each
+from rfpose.layout.maps import Mirrors, normal_map, normal_without_each
+from rfpose.measurement import Estimator, Noise
 
 __all__ = ["TransmitterSensitivity", "transmitter_sensitivity"]
 

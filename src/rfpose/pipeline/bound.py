@@ -10,18 +10,13 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.dsp.calibration import phase_average
 from rfpose.geometry import rot_enu_from_mirror
+from rfpose.measurement import reflectors_of
 from rfpose.multilat import normal_bound
 from rfpose.multilat.ground import ground_bound
 from rfpose.multilat.rigid import full_covariance, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
-from rfpose.pipeline.choice import PoseChoice, reflectors_of
-from rfpose.pipeline.mirrors import (
-    MirrorGroup,
-    calibration_sight,
-    group_hz,
-    is_calibrated,
-    mirror_groups,
-)
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, is_calibrated, mirror_groups
 from rfpose.pipeline.noise import PhaseNoise
 from rfpose.scenario import Scenario
 
@@ -72,7 +67,7 @@ def normal_bound_rad(
         rot = rot_enu_from_mirror(normal_enu[:, group.column].reshape(-1, 3))
         cov = _rigid(scenario, choice, noise, group, rot, coefficient)
         if group.learns_delays:
-            cov = _learned(scenario, group, rot, cov, time_s)
+            cov = _learned(group, rot, cov, time_s)
         out[:, group.column] = tilt_sigma_rad(cov[:, :6, :6], rot[:, :, 2]).reshape(len(start), -1)
     return out
 
@@ -103,11 +98,12 @@ def _rigid(
 ) -> FloatArray:
     """Covariance of pose and clocks of a group's mirrors, first axis frame × heliostat."""
     n_frame = len(noise.tone_rad)
-    sigma, common = _range_noise(scenario, noise, group)
+    calibration = noise.calibration_rad if is_calibrated(scenario) else None
+    sigma, common = group.range_noise(noise.tone_rad, noise.carrier_rad, calibration)
     places = np.tile(group.places_m, (n_frame, 1, 1))
     pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
-    known = group.knowledge(scenario, n_frame)
-    classes = np.arange(sigma.shape[1])
+    known = group.knowledge(n_frame)
+    classes = group.waves.clock_class
     if choice.reflection == "none":
         return full_covariance(
             scenario.transmitter_enu_m,
@@ -136,7 +132,7 @@ def _rigid(
             transmitter_sigma_m=common[rows],
             clock_class=classes,
             carrier_rf_hz=scenario.carrier_rf_hz,
-            tone_hz=group_hz(scenario, group),
+            tone_hz=group.waves.tone_hz,
             reflectors=reflectors,
             coefficient=[complex(c) for c in truth],
             calibration_enu_m=calibration_sight(average, scenario, rows // n_helio),
@@ -147,27 +143,7 @@ def _rigid(
     return out
 
 
-def _range_noise(scenario: Scenario, noise: PhaseNoise, group: MirrorGroup) -> tuple[FloatArray, FloatArray]:
-    """Sigma of ranges (mirror, wavelength, receiver, transmitter), and of transmitters (mirror, wavelength, …) [m]."""
-    n = len(noise.tone_rad) * len(group.column)
-    sigma, common = [], []
-    for q in np.argsort(-scenario.wavelength_m):
-        to_m = scenario.wavelength_m[q] / (2.0 * np.pi)
-        sigma.append(to_m * noise.tone_rad[..., q][:, group.rows].reshape(n, group.rows.shape[1], -1))
-        if is_calibrated(scenario):
-            common.append(to_m * np.repeat(noise.calibration_rad[..., q], len(group.column), axis=0))
-        else:
-            common.append(np.full((n, len(scenario.transmitter)), np.inf))
-    if group.uses_carrier:
-        to_m = scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz / (2.0 * np.pi)
-        sigma.append(to_m * noise.carrier_rad[:, group.rows].reshape(n, group.rows.shape[1], -1))
-        common.append(np.full((n, len(scenario.transmitter)), np.inf))
-    return np.stack(sigma, axis=1), np.stack(common, axis=1)
-
-
-def _learned(
-    scenario: Scenario, group: MirrorGroup, rot: FloatArray, cov: FloatArray, time_s: FloatArray
-) -> FloatArray:
+def _learned(group: MirrorGroup, rot: FloatArray, cov: FloatArray, time_s: FloatArray) -> FloatArray:
     """Let earlier frames' delays count: the filter's own covariances, at the true poses."""
     n_frame, n_helio, n_receiver = len(time_s), len(group.column), group.rows.shape[1]
     n_class = (cov.shape[1] - 6) // n_receiver
@@ -181,6 +157,6 @@ def _learned(
         np.zeros((n_frame, n_helio, n_class, n_receiver)),
         by_frame(cov),
         time_s=time_s,
-        drift_m_per_sqrt_s=group.drift_m_per_sqrt_s(scenario),
+        drift_m_per_sqrt_s=group.estimator.delay_drift_m_per_sqrt_s or 0.0,
     )
     return learned.cov.reshape(-1, 6, 6)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
-from rfpose.multilat.ground import Reflector, Surface
-from rfpose.multilat.ground.model import heights_m
+from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.scenario import Scenario
 
-__all__ = ["POSES", "REFLECTIONS", "PoseChoice", "check_reflectors", "choose", "reflectors_of"]
+__all__ = ["POSES", "REFLECTIONS", "PoseChoice", "choose"]
 
 POSES = ("rigid", "independent")
 """Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's, as
@@ -139,63 +137,3 @@ def _check_filter(scenario: Scenario, choice: PoseChoice) -> None:
             "to the frames: a filter would claim more than it knows; leave the filter off (`--no-filter`), or leave "
             "`receiver_delay_drift_s_per_sqrt_min` away"
         )
-
-
-def reflectors_of(scenario: Scenario, model: str) -> tuple[Reflector, ...]:
-    """Return the planes of a scenario, the ground first, its coefficient by ``model``."""
-    table = scenario.reflection
-    if model == "none":
-        return ()
-    surface = None
-    if model == "fresnel" and table.permittivity is not None:
-        surface = Surface(
-            permittivity=table.permittivity,
-            conductivity_s_per_m=table.conductivity_s_per_m,
-            polarisation=table.polarisation,
-        )
-    ground = Reflector(
-        name="ground",
-        point_enu_m=(0.0, 0.0, table.height_m),
-        normal_enu=table.normal_enu,
-        coefficient=complex(*table.coefficient) if model == "known" and table.coefficient is not None else None,
-        surface=surface,
-        scaled=table.scaled and surface is not None,
-    )
-    walls = tuple(
-        Reflector(
-            name=plane.name,
-            point_enu_m=plane.point_enu_m,
-            normal_enu=plane.normal_enu,
-            coefficient=None if plane.coefficient is None else complex(*plane.coefficient),
-        )
-        for plane in table.plane
-    )
-    return (ground, *walls)
-
-
-def check_reflectors(scenario: Scenario, reflectors: tuple[Reflector, ...]) -> None:
-    """Refuse planes behind which something stands that is to be reflected in them.
-
-    Raises
-    ------
-    ScenarioError
-        Carriers without a radio frequency.
-    GeometryError
-        Names the plane and what lies behind it.
-    """
-    if reflectors:
-        scenario.need_rf_carriers("the model of reflections")
-    standing = (
-        ("transmitter", scenario.transmitter_ids, scenario.transmitter_enu_m),
-        ("calibration receiver", tuple(r.id for r in scenario.calibration_receiver), scenario.calibration_enu_m),
-        ("pivot of heliostat", scenario.heliostat_ids, scenario.pivot_enu_m),
-    )
-    for reflector in reflectors:
-        for kind, names, place in standing:
-            for name, height in zip(names, heights_m(place, reflector), strict=True):
-                if height <= 0.0:
-                    raise GeometryError(
-                        f"{kind} `{name}` lies {-height:.3g} m behind reflector `{reflector.name}`: nothing is "
-                        "reflected there; move the plane (`height_m`, `point_enu_m`), turn its `normal_enu` around, or "
-                        "leave it out"
-                    )

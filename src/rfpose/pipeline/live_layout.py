@@ -15,8 +15,9 @@ from rfpose.errors import GeometryError, RfposeError, ScenarioError
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
 from rfpose.layout.fields import radial_staggered, read_positions, with_field
-from rfpose.layout.maps import ESTIMATORS, SCENARIO, Mirrors, summarise
+from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
 from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
+from rfpose.measurement import SCENARIO
 from rfpose.multilat import check_unambiguous
 from rfpose.scenario import Scenario, Transmitter, check_scenario
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -12,20 +11,15 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.dsp.calibration import PhaseAverage
+from rfpose.measurement import Estimator, Wavelengths, estimator_of, wavelengths_of
+from rfpose.measurement.wavelengths import CARRIER
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.ground import CalibrationSight
 from rfpose.multilat.rigid import Knowledge
 from rfpose.multilat.rigid.integers import Observation
-from rfpose.scenario import Heliostat, Scenario
+from rfpose.scenario import Scenario
 
-__all__ = [
-    "MirrorGroup",
-    "calibration_sight",
-    "group_hz",
-    "is_calibrated",
-    "mirror_groups",
-    "observations",
-]
+__all__ = ["MirrorGroup", "calibration_sight", "is_calibrated", "mirror_groups", "observations"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,57 +35,68 @@ class MirrorGroup:
         From the pivot, in the mirror frame [m].
     pivot_enu_m : (heliostat, xyz)
         [m].
-    kind
-        The first of them.
-    uses_carrier
-        Whether carriers are compared between the receivers.
+    estimator
+        What is known of them.
+    waves
+        What is seen of them.
     """
 
     column: npt.NDArray[np.int64]
     rows: npt.NDArray[np.int64]
     places_m: FloatArray
     pivot_enu_m: FloatArray
-    kind: Heliostat
-    uses_carrier: bool
+    estimator: Estimator
+    waves: Wavelengths
 
     @property
     def learns_delays(self) -> bool:
         """Whether delays between receivers are learned over frames."""
-        return self.kind.receiver_delay_drift_s_per_sqrt_min is not None
+        return self.estimator.delay_drift_m_per_sqrt_s is not None
 
-    def knowledge(self, scenario: Scenario, n_frame: int) -> Knowledge:
-        """Return what the scenario knows of these mirrors, one row a frame and heliostat."""
-        kind = self.kind
-        delay = kind.receiver_delay_sigma_s
-        shared = kind.oscillator == "shared" and delay is not None
-        return Knowledge(
-            clock_sigma_m=float(delay or 0.0) * scenario.radio.propagation_speed_mps if shared else np.inf,
-            pivot_enu_m=np.tile(self.pivot_enu_m, (n_frame, 1)) if kind.pivot_sigma_m is not None else None,
-            pivot_sigma_m=np.inf if kind.pivot_sigma_m is None else kind.pivot_sigma_m,
-            two_axis=kind.mount == "azimuth_elevation",
-        )
+    def knowledge(self, n_frame: int) -> Knowledge:
+        """Return what is known of these mirrors, one row a frame and heliostat."""
+        return self.estimator.knowledge(np.tile(self.pivot_enu_m, (n_frame, 1)))
 
-    def drift_m_per_sqrt_s(self, scenario: Scenario) -> float:
-        """Random-walk rate of the delays [m/√s]."""
-        rate = self.kind.receiver_delay_drift_s_per_sqrt_min or 0.0
-        return rate / math.sqrt(60.0) * scenario.radio.propagation_speed_mps
+    def of_mirrors(self, values: npt.NDArray[np.float64]) -> FloatArray:
+        """Take values (frame, receiver axis, …) apart: (frame × heliostat, receiver, …)."""
+        picked = values[:, self.rows]
+        return picked.reshape(-1, *picked.shape[2:])
+
+    def range_noise(
+        self, tone_rad: FloatArray, carrier_rad: FloatArray, calibration_rad: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return phases' noise as that of ranges; first axis frame × heliostat.
+
+        Parameters
+        ----------
+        tone_rad, carrier_rad : (frame, receiver axis, transmitter, tone), (frame, receiver axis, transmitter)
+            Own noise [rad].
+        calibration_rad : (frame, transmitter, tone)
+            Of the electronic phases [rad]; None: nothing measures them.
+
+        Returns
+        -------
+        sigma_m : (mirror, group, receiver, transmitter)
+        transmitter_sigma_m : (mirror, group, transmitter)
+            Common to all receivers; infinity where nothing tells.
+        """
+        sigma, common = [], []
+        for q, wavelength in zip(self.waves.tone, self.waves.wavelength_m, strict=True):
+            to_m = wavelength / (2.0 * np.pi)
+            sigma.append(self.of_mirrors(to_m * (carrier_rad if q == CARRIER else tone_rad[..., q])))
+            per_frame = np.full(carrier_rad[:, 0].shape, np.inf)
+            if q != CARRIER and calibration_rad is not None:
+                per_frame = to_m * calibration_rad[..., q]
+            common.append(np.repeat(per_frame, len(self.column), axis=0))
+        return np.stack(sigma, axis=1), np.stack(common, axis=1)
 
 
 def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
     """Sort heliostats by number of receivers and by what is known of them."""
-    kinds: dict[tuple[object, ...], list[int]] = {}
+    kinds: dict[tuple[int, Estimator], list[int]] = {}
     for i, h in enumerate(scenario.heliostat):
-        key = (
-            len(h.receiver_ids),
-            h.oscillator,
-            h.receiver_delay_sigma_s,
-            h.receiver_delay_drift_s_per_sqrt_min,
-            h.pivot_sigma_m,
-            h.mount,
-            h.carrier_phase,
-        )
-        kinds.setdefault(key, []).append(i)
-    for members in kinds.values():
+        kinds.setdefault((len(h.receiver_ids), estimator_of(scenario, h)), []).append(i)
+    for (_, estimator), members in kinds.items():
         helio = [scenario.heliostat[i] for i in members]
         arm = np.array([[0.0, 0.0, h.arm_m] for h in helio])
         yield MirrorGroup(
@@ -99,8 +104,8 @@ def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
             rows=np.array([np.arange(len(scenario.receivers))[scenario.receiver_rows(i)] for i in members]),
             places_m=np.array([h.receiver_mirror_m for h in helio]) + arm[:, None],
             pivot_enu_m=scenario.pivot_enu_m[members],
-            kind=helio[0],
-            uses_carrier=scenario.compares_carriers(helio[0]),
+            estimator=estimator,
+            waves=wavelengths_of(scenario, carrier=estimator.carrier),
         )
 
 
@@ -109,63 +114,37 @@ def is_calibrated(scenario: Scenario) -> bool:
     return bool(scenario.calibration_receiver)
 
 
-def group_hz(scenario: Scenario, group: MirrorGroup) -> FloatArray:
-    """(wavelength,) tones as `observations` orders them [Hz]; zero stands for the carrier."""
-    tones = scenario.tone_hz[np.argsort(-scenario.wavelength_m)]
-    return np.append(tones, 0.0) if group.uses_carrier else tones
-
-
 def observations(
     tones: TonePhases, calibration: Calibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
 ) -> list[Observation]:
-    """Phases of a group's mirrors as ranges, coarsest tone first, carrier last; first axis frame × heliostat.
+    """Phases of a group's mirrors as ranges, in the order of its wavelengths; first axis frame × heliostat.
 
     Without calibration receivers the transmitters' own phases stay in, unknown: differences between receivers tell.
     """
-    n_frame, n_helio = len(tones.frame_start_index), len(group.column)
-    n_receiver, n_transmitter = group.rows.shape[1], len(scenario.transmitter)
-
-    def of_mirrors(values: npt.NDArray[np.float64]) -> FloatArray:
-        return values[:, group.rows].reshape(n_frame * n_helio, n_receiver, *values.shape[2:])
-
+    calibrated = is_calibrated(scenario)
+    sigma, common = group.range_noise(
+        tones.sigma_rad, tones.carrier_sigma_rad, calibration.sigma_rad if calibrated else None
+    )
     out = []
-    for k, q in enumerate(np.argsort(-scenario.wavelength_m)):
-        wavelength = float(scenario.wavelength_m[q])
-        to_m = wavelength / (2.0 * np.pi)
-        electronic = calibration.phase_rad[:, None, :, q] if is_calibrated(scenario) else 0.0
-        z = of_mirrors(-to_m * (tones.phase_rad[..., q] - electronic))
-        if k == 0 and not is_calibrated(scenario):
-            z = _coarse_uncalibrated(z, wavelength)
+    for k, q in enumerate(group.waves.tone):
+        wavelength = group.waves.wavelength_m[k]
+        if q == CARRIER:
+            phase = np.where(np.isfinite(tones.phase_rad[..., 0]), np.angle(tones.carrier), np.nan)
+        else:
+            phase = tones.phase_rad[..., q] - (calibration.phase_rad[:, None, :, q] if calibrated else 0.0)
+        z = group.of_mirrors(-wavelength / (2.0 * np.pi) * phase)
+        if k == 0 and not calibrated:
+            z = _coarse_uncalibrated(z, float(wavelength[0]))
         elif k == 0:
-            z = _coarse(
-                z, of_mirrors(ranges.range_difference_m), of_mirrors(ranges.reference.astype(np.float64)), wavelength
-            )
-        per_frame = np.full((n_frame * n_helio, n_transmitter), np.inf)
-        if is_calibrated(scenario):
-            per_frame = to_m * np.repeat(calibration.sigma_rad[..., q], n_helio, axis=0)
+            reference = group.of_mirrors(ranges.reference.astype(np.float64))
+            z = _coarse(z, group.of_mirrors(ranges.range_difference_m), reference, float(wavelength[0]))
         out.append(
             Observation(
                 range_m=z,
-                sigma_m=of_mirrors(to_m * tones.sigma_rad[..., q]),
-                transmitter_sigma_m=per_frame,
-                wavelength_m=np.full(n_transmitter, wavelength),
-                clock_class=k,
-            )
-        )
-    if group.uses_carrier:
-        carrier_m = scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz
-        to_m_each = carrier_m / (2.0 * np.pi)
-        seen = np.isfinite(tones.phase_rad[..., 0])
-        phase = np.where(seen, np.angle(tones.carrier), np.nan)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sigma = tones.carrier_sigma / np.abs(tones.carrier)
-        out.append(
-            Observation(
-                range_m=of_mirrors(-to_m_each * phase),
-                sigma_m=of_mirrors(to_m_each * sigma),
-                transmitter_sigma_m=np.full((n_frame * n_helio, n_transmitter), np.inf),
-                wavelength_m=carrier_m,
-                clock_class=len(out),
+                sigma_m=sigma[:, k],
+                transmitter_sigma_m=common[:, k],
+                wavelength_m=np.array(wavelength),
+                clock_class=int(group.waves.clock_class[k]),
             )
         )
     return out
@@ -213,7 +192,7 @@ def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDAr
     frame : (mirror,)
         Of each mirror that is to be solved.
     """
-    order = np.argsort(-scenario.wavelength_m)
+    order = wavelengths_of(scenario).tone
     per_m = (2.0 * np.pi / scenario.wavelength_m)[:, None]
 
     def change_m(shift_m: FloatArray, frames: npt.NDArray[np.int64]) -> FloatArray:

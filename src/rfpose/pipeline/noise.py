@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.dsp.bounds import phase_bound_rad
+from rfpose.measurement import phase_sigma_rad
 from rfpose.pipeline.result import Result
 from rfpose.truth import Truth
 
@@ -54,11 +54,9 @@ def phase_noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64], *, re
     """
     tones = result.tones
     if truth.tone_snr is None or reported:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            carrier = tones.carrier_sigma / np.abs(tones.carrier)
         return PhaseNoise(
             tone_rad=tones.sigma_rad,
-            carrier_rad=carrier,
+            carrier_rad=tones.carrier_sigma_rad,
             calibration_rad=result.calibration.sigma_rad,
             own_m=result.ranges.sigma_m,
             calibration_m=result.ranges.calibration_sigma_m,
@@ -67,8 +65,7 @@ def phase_noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64], *, re
     scenario = result.scenario
     snr = np.array(truth.tone_snr[np.maximum(rows, 0)])
     snr[rows < 0] = np.nan
-    with np.errstate(invalid="ignore"):
-        tone = phase_bound_rad(scenario.radio.frame_samples, np.where(snr > 0.0, snr, np.nan))
+    tone, carrier = phase_sigma_rad(scenario, snr)
     to_m = scenario.wavelength_m / (2.0 * np.pi)
     is_calibration = np.array([r.calibration is not None for r in scenario.receivers], bool)
     own_m = _combine(tone * to_m)
@@ -76,8 +73,7 @@ def phase_noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64], *, re
     seen = np.isfinite(tones.phase_rad)
     return PhaseNoise(
         tone_rad=np.where(seen, tone, np.nan),
-        # a carrier has 2/m² times the tone's power, and all of its phase's noise
-        carrier_rad=np.where(seen, tone, np.nan)[..., 0] * scenario.tone[0].modulation_index / np.sqrt(2.0),
+        carrier_rad=np.where(seen[..., 0], carrier, np.nan),
         calibration_rad=_combine(np.moveaxis(np.where(seen, tone, np.nan)[:, is_calibration], 1, -1)),
         own_m=own_m,
         calibration_m=np.broadcast_to(calibration_m[:, None], own_m.shape),

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, TonePhases, calibrate
 from rfpose.errors import GeometryError, ScenarioError
+from rfpose.measurement import check_reflectors, reflectors_of
 from rfpose.multilat import (
     Fixes,
     FixStatus,
@@ -22,7 +23,7 @@ from rfpose.multilat import (
     solve_poses,
 )
 from rfpose.multilat.fix import Side, check_transmitters
-from rfpose.pipeline.choice import POSES, PoseChoice, check_reflectors, choose, reflectors_of
+from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.rigid import solve_rigid_poses

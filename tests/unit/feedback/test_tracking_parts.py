@@ -24,7 +24,8 @@ from rfpose.feedback.tracking.score import quantile
 from rfpose.feedback.tracking.timeline import days, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.feedback.wind.spectrum import wind_deflection
-from rfpose.layout.maps import ESTIMATORS, Estimator, mirrors_facing, noise_of, normal_map
+from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
+from rfpose.measurement import Estimator, noise_of
 from rfpose.multilat.rigid import Knowledge, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
 
@@ -262,6 +263,20 @@ def test_a_reflection_that_is_ignored_turns_normals():
     assert np.sqrt(np.mean(ignored.bias_rad**2)) > 1e-3
     assert not estimated.bias_rad.any()
     assert np.all(estimated.sigma_rad < 3.0 * ignored.sigma_rad)
+
+
+def test_a_few_mirrors_stand_for_a_large_field_over_reflecting_ground():
+    scenario = changed(radio={"ground": "ignored"})
+    spread = scenario.simulation.model_copy(update={"path_loss": "free_space"})
+    scenario = scenario.model_copy(update={"simulation": spread})
+    angle = np.linspace(0.0, 6.0 * np.pi, 201)
+    radius = np.linspace(20.0, 90.0, 201)
+    pivot = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(201, 2.0)], axis=1)
+    normal = geometry.unit(np.array([0.0, 0.0, 50.0]) - pivot + [10.0, 40.0, 60.0])
+    errors = RadioModel(scenario, pivot, usual_normal_enu=normal).errors(normal, np.random.default_rng(0))
+    assert errors.solved.all()
+    assert np.all(errors.sigma_rad > 0.0)
+    assert np.sqrt(np.mean(errors.bias_rad**2)) > 1e-3
 
 
 # ---- methods, scores ----------------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout import maps
 from rfpose.layout.budget import SOURCES, error_budget, make_plan, target_slope
 from rfpose.layout.budget.world import World
+from rfpose.measurement import noise_of
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.simulate import Simulator
 
@@ -118,8 +119,7 @@ def test_noise_lines_add_up_to_the_map():
     scenario = two_tones(simulation={"adc_bits": 16, "sample_format": "complex64"})
     lines = lines_of(scenario)
     assert "quantisation" not in lines
-    noise = maps.noise_of(scenario)
-    # the map has one clock for all tones
+    noise = noise_of(scenario)
     plan = plan_of(scenario)
     bound = maps.normal_map(scenario.transmitter_enu_m, plan.mirrors, noise, plan.estimator)
     names = ("thermal noise", "calibration noise", "pivot survey", "clock")
@@ -163,7 +163,7 @@ def test_what_is_fixed_to_the_mirror_and_what_drifts():
     # one calibration receiver's noise reaches the mirrors the same way
     one = lines_of(site(simulation=drift, budget={"calibration_age_s": 36.0}))
     plan = plan_of(site())
-    sigma_m = 0.05 * np.sqrt(36.0 / 3600.0) * plan.wavelength_m[0, 0] / (2.0 * np.pi)
+    sigma_m = 0.05 * np.sqrt(36.0 / 3600.0) * plan.waves.wavelength_m[0, 0] / (2.0 * np.pi)
     share = sigma_m / plan.calibration_thermal_m[0, 0, 0]
     np.testing.assert_allclose(one["phase drift"].normal_rad, share * one["calibration noise"].normal_rad)
     levelled = lines_of(two_tones(simulation=drift, budget={"calibration_age_s": 1e6, "drift_time_scale_s": 10.0}))

@@ -16,13 +16,13 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.layout.maps import Noise, noise_of
+from rfpose.measurement import estimator_of, noise_of, simulated_ground, wavelengths_of
 from rfpose.multilat.fix import check_transmitters
-from rfpose.multilat.ground import Reflector, solve_with_ground
+from rfpose.multilat.ground import solve_with_ground
 from rfpose.multilat.ground.model import range_shift_m
-from rfpose.multilat.rigid import Knowledge, rigid_bound
+from rfpose.multilat.rigid import rigid_bound
 from rfpose.multilat.rigid.integers import Observation
-from rfpose.scenario import Heliostat, Scenario
+from rfpose.scenario import Scenario
 
 __all__ = ["RadioErrors", "RadioModel"]
 
@@ -82,9 +82,12 @@ class RadioModel:
         check_transmitters(scenario.transmitter_enu_m)
         self._scenario = scenario
         self._pivot = np.array(pivot_enu_m)
-        self._kind: Heliostat = scenario.heliostat[0]
-        self._places = np.array(self._kind.receiver_mirror_m) + np.array([0.0, 0.0, self._kind.arm_m])
-        self._noise: Noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
+        kind = scenario.heliostat[0]
+        self._places = np.array(kind.receiver_mirror_m) + np.array([0.0, 0.0, kind.arm_m])
+        self._estimator = estimator_of(scenario, kind)
+        self._waves = wavelengths_of(scenario, carrier=self._estimator.carrier)
+        self._noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
+        self._own_m, self._common_m = self._noise.groups(carrier=self._estimator.carrier)
         ground = scenario.simulation.ground
         self._handling = "none" if ground is None else scenario.tracking.radio.ground
         if self._handling != "none":
@@ -129,12 +132,10 @@ class RadioModel:
     def _covariance(self, rot: FloatArray, hidden: npt.NDArray[np.bool_]) -> FloatArray:
         """(mirror, 3, 3) of the rotation; the carrier takes part where the tones find its whole wavelengths."""
         pivot = self._pivot
-        sigma = np.broadcast_to(self._sigma_m(rot), (len(rot), *self._sigma_shape()))
-        sigma = np.where(hidden, np.inf, sigma)
-        n_tone = len(self._scenario.tone)
-        known = self._knowledge(pivot)
-        common = self._common_m()
-        classes = np.arange(sigma.shape[1])
+        sigma = np.where(hidden, np.inf, self._sigma_m(pivot, rot))
+        n_tone = self._waves.n_tone
+        known = self._estimator.knowledge(pivot)
+        common, classes = self._common_m, self._waves.clock_class
         bound = rigid_bound(
             self._scenario.transmitter_enu_m, self._places, pivot, rot, sigma_m=sigma[:, :n_tone],
             transmitter_sigma_m=common[:n_tone], clock_class=classes[:n_tone], knowledge=known,
@@ -142,7 +143,7 @@ class RadioModel:
         turn = bound[:, 3:, 3:]
         if sigma.shape[1] == n_tone:
             return turn
-        wavelength = self._carrier_wavelength_m()
+        wavelength = self._waves.wavelength_m[-1]
         extent = float(np.linalg.norm(self._places - self._places[0], axis=1).max())
         finds = extent * np.sqrt(np.trace(turn, axis1=1, axis2=2)) < _SAFE_WAVELENGTHS * float(wavelength.min())
         finer = rigid_bound(
@@ -153,47 +154,10 @@ class RadioModel:
 
     # -- what goes into a pose -----------------------------------------------------------------------------
 
-    def _uses_carrier(self) -> bool:
-        return self._scenario.compares_carriers(self._kind)
-
-    def _carrier_wavelength_m(self) -> FloatArray:
-        return np.asarray(self._scenario.radio.propagation_speed_mps / self._scenario.carrier_rf_hz)
-
-    def _sigma_shape(self) -> tuple[int, int, int]:
-        n_group = len(self._scenario.tone) + int(self._uses_carrier())
-        return n_group, self._places.shape[0], len(self._scenario.transmitter)
-
-    def _sigma_m(self, rot: FloatArray) -> FloatArray:
-        """(mirror or 1, group, receiver, transmitter) own noise of ranges [m]."""
-        noise = self._noise
-        rows = list(noise.tone_sigma_m)
-        if self._uses_carrier() and noise.carrier_sigma_m is not None:
-            rows.append(noise.carrier_sigma_m)
-        sigma = np.stack(rows)[None, :, None, :]
-        if noise.reference_range_m is not None:
-            receiver = self._pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)
-            distance = np.linalg.norm(receiver[:, :, None] - self._scenario.transmitter_enu_m, axis=-1)
-            sigma = sigma * (distance / noise.reference_range_m)[:, None]
-        return np.asarray(sigma)
-
-    def _common_m(self) -> FloatArray:
-        """(group, transmitter) errors common to all receivers [m]."""
-        calibrated = bool(self._scenario.calibration_receiver)
-        tones = self._noise.calibration_sigma_m if calibrated else np.full_like(self._noise.tone_sigma_m, np.inf)
-        if not self._uses_carrier():
-            return np.asarray(tones)
-        return np.concatenate([tones, np.full((1, tones.shape[1]), np.inf)])
-
-    def _knowledge(self, pivot: FloatArray) -> Knowledge:
-        kind = self._kind
-        delay = kind.receiver_delay_sigma_s
-        shared = kind.oscillator == "shared" and delay is not None
-        return Knowledge(
-            clock_sigma_m=float(delay or 0.0) * self._scenario.radio.propagation_speed_mps if shared else np.inf,
-            pivot_enu_m=pivot if kind.pivot_sigma_m is not None else None,
-            pivot_sigma_m=np.inf if kind.pivot_sigma_m is None else kind.pivot_sigma_m,
-            two_axis=kind.mount == "azimuth_elevation",
-        )
+    def _sigma_m(self, pivot: FloatArray, rot: FloatArray) -> FloatArray:
+        """(mirror, group, receiver, transmitter) own noise of ranges [m]."""
+        receiver = pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)
+        return self._own_m[:, None] * self._noise.loss(self._scenario.transmitter_enu_m, receiver)[:, None]
 
     def _spreads(self) -> bool:
         """Whether the longer ray is the weaker one."""
@@ -211,13 +175,12 @@ class RadioModel:
 
     def _observations(self, pivot: FloatArray, rot: FloatArray) -> list[Observation]:
         """Ranges of mirrors over the reflecting ground, without noise."""
-        scenario, ground = self._scenario, self._scenario.simulation.ground
+        scenario, ground, waves = self._scenario, self._scenario.simulation.ground, self._waves
         assert ground is not None
-        mirror = Reflector(point_enu_m=(0.0, 0.0, ground.height_m), coefficient=complex(*ground.coefficient))
-        tone_hz = np.append(scenario.tone_hz, 0.0) if self._uses_carrier() else scenario.tone_hz
+        mirror = simulated_ground(scenario, coefficient=complex(*ground.coefficient))
         receiver = (pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)).reshape(-1, 3)
         distance = np.linalg.norm(receiver[:, None] - scenario.transmitter_enu_m, axis=-1)
-        common = self._common_m()
+        common = self._common_m
 
         def shift(points: FloatArray) -> FloatArray:
             return range_shift_m(
@@ -225,7 +188,7 @@ class RadioModel:
                 points,
                 reflectors=[mirror],
                 carrier_rf_hz=scenario.carrier_rf_hz,
-                tone_hz=tone_hz,
+                tone_hz=waves.tone_hz,
                 free_space=self._spreads(),
                 propagation_speed_mps=scenario.radio.propagation_speed_mps,
             )
@@ -234,30 +197,22 @@ class RadioModel:
         if scenario.calibration_receiver:
             z = z - shift(scenario.calibration_enu_m).mean(axis=0) * np.isfinite(common.T)
         z = z.reshape(len(pivot), len(self._places), len(scenario.transmitter), -1)
-        sigma = np.broadcast_to(self._sigma_m(rot), (len(self._pivot), *self._sigma_shape()))
-        sigma = sigma[: len(pivot)]
-        waves = [np.full(len(scenario.transmitter), w) for w in scenario.wavelength_m]
-        order = [int(q) for q in np.argsort(-scenario.wavelength_m)]
-        if self._uses_carrier():
-            order.append(len(waves))
-            waves.append(self._carrier_wavelength_m())
+        sigma = self._sigma_m(pivot, rot)
         return [
             Observation(
-                range_m=np.ascontiguousarray(z[..., q]),
-                sigma_m=np.ascontiguousarray(sigma[:, q]),
-                transmitter_sigma_m=np.broadcast_to(common[q], (len(pivot), common.shape[1])).copy(),
-                wavelength_m=waves[q],
-                clock_class=int(q == len(scenario.tone)),
+                range_m=np.ascontiguousarray(z[..., g]),
+                sigma_m=np.ascontiguousarray(sigma[:, g]),
+                transmitter_sigma_m=np.broadcast_to(common[g], (len(pivot), common.shape[1])).copy(),
+                wavelength_m=waves.wavelength_m[g],
+                clock_class=int(waves.clock_class[g]),
             )
-            for q in order
+            for g in range(len(waves.tone))
         ]
 
     def _solve(self, rot: FloatArray, *, estimate: bool) -> tuple[FloatArray, FloatArray]:
         """Return normals and rotation covariances of the sampled mirrors by the solver itself."""
         sample = self._nearest[0]
         pivot, rot = self._pivot[sample], rot[sample]
-        ground = self._scenario.simulation.ground
-        assert ground is not None
         found = solve_with_ground(
             self._scenario.transmitter_enu_m,
             self._places,
@@ -265,9 +220,10 @@ class RadioModel:
             carrier_rf_hz=self._scenario.carrier_rf_hz,
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,
-            reflectors=(Reflector(point_enu_m=(0.0, 0.0, ground.height_m)),) if estimate else (),
+            reflectors=(simulated_ground(self._scenario),) if estimate else (),
             calibration_enu_m=self._scenario.calibration_enu_m if self._scenario.calibration_receiver else None,
-            knowledge=self._knowledge(pivot),
+            tone_count=self._waves.n_tone,
+            knowledge=self._estimator.knowledge(pivot),
             free_space=self._spreads(),
             propagation_speed_mps=self._scenario.radio.propagation_speed_mps,
             min_probability=0.0,

@@ -10,7 +10,16 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout.gain import Gain, Reflection, normal_gain
-from rfpose.layout.maps import Estimator, Mirrors, check_site, estimators_of, noise_of
+from rfpose.layout.maps import Mirrors, check_site
+from rfpose.measurement import (
+    Estimator,
+    Wavelengths,
+    calibration_sigma_m,
+    estimators_of,
+    noise_of,
+    simulated_ground,
+    wavelengths_of,
+)
 from rfpose.multilat import check_unambiguous
 from rfpose.multilat.ground import Reflector, range_shift_m
 from rfpose.multilat.rigid import Knowledge
@@ -27,19 +36,14 @@ _COEFFICIENT_STEP = 1e-4
 class Plan:
     """The working point: expected poses, wavelengths used, and what the solver assumes; arrays are read-only.
 
-    A group is a tone, coarsest first, or last the carrier.
-
     Attributes
     ----------
     scenario, mirrors
         The site, and the expected poses of its mirrors.
     estimator
         As `rfpose process` would solve them.
-    wavelength_m : (group, transmitter)
-        [m].
-    tone_hz : (group,)
-        Zero for the carrier [Hz].
-    clock_class : (group,)
+    waves
+        The wavelengths used; a group is one of them.
     thermal_m : (mirror, group, receiver, transmitter)
         Own noise without the converter's [m].
     calibration_thermal_m : (calibration receiver, tone, transmitter)
@@ -55,9 +59,7 @@ class Plan:
     scenario: Scenario
     mirrors: Mirrors
     estimator: Estimator
-    wavelength_m: FloatArray
-    tone_hz: FloatArray
-    clock_class: npt.NDArray[np.int64]
+    waves: Wavelengths
     thermal_m: FloatArray
     calibration_thermal_m: FloatArray
     converter_share: float
@@ -65,11 +67,6 @@ class Plan:
     by_transmitter: FloatArray
     calibration_by_place: FloatArray
     calibration_by_transmitter: FloatArray
-
-    @property
-    def n_tone(self) -> int:
-        """Tones used."""
-        return int(np.count_nonzero(self.tone_hz))
 
     @property
     def sigma_m(self) -> FloatArray:
@@ -96,9 +93,9 @@ class Plan:
     @property
     def transmitter_sigma_m(self) -> FloatArray:
         """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m]."""
-        out = np.full(self.wavelength_m.shape, np.inf)
-        if self.scenario.calibration_receiver:
-            out[: self.n_tone] = (self.calibration_sigma_m**-2.0).sum(axis=0) ** -0.5
+        out = np.full(self.waves.wavelength_m.shape, np.inf)
+        noise = self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
+        out[: self.waves.n_tone] = calibration_sigma_m(noise, self.survey_sigma_m)
         return out
 
     @property
@@ -113,15 +110,13 @@ class Plan:
 
     def reflector(self, coefficient: complex | None, height_offset_m: float = 0.0) -> Reflector:
         """Return the ground with a coefficient (None: to be estimated), at another height."""
-        ground = self.scenario.simulation.ground
-        assert ground is not None
-        return Reflector(point_enu_m=(0.0, 0.0, ground.height_m + height_offset_m), coefficient=coefficient)
+        return simulated_ground(self.scenario, coefficient=coefficient, height_offset_m=height_offset_m)
 
     def shift_m(
         self, transmitter_enu_m: FloatArray, point_enu_m: FloatArray, reflector: Reflector, *, tones_only: bool = False
     ) -> FloatArray:
         """Return what a reflection adds to ranges, (..., transmitter, group) of points (..., xyz) [m]."""
-        tone = self.tone_hz[: self.n_tone] if tones_only else self.tone_hz
+        tone = self.waves.tone_hz[: self.waves.n_tone] if tones_only else self.waves.tone_hz
         out = range_shift_m(
             transmitter_enu_m,
             point_enu_m.reshape(-1, 3),
@@ -140,19 +135,12 @@ class Plan:
         if self.scenario.calibration_receiver:
             there = self.shift_m(transmitter, self.scenario.calibration_enu_m, reflector, tones_only=True)
             mean = np.einsum("ctg,cgt->gt", there, self.calibration_weight)
-            shift[:, : self.n_tone] -= mean[:, None]
+            shift[:, : self.waves.n_tone] -= mean[:, None]
         return shift
 
     def knowledge(self, pivot_enu_m: FloatArray) -> Knowledge:
         """Return what the solver is told, with surveyed pivots (row, xyz)."""
-        known = np.isfinite(self.estimator.pivot_sigma_m)
-        return Knowledge(
-            clock_sigma_m=self.estimator.clock_sigma_m,
-            pivot_enu_m=pivot_enu_m if known else None,
-            pivot_sigma_m=self.estimator.pivot_sigma_m,
-            two_axis=self.estimator.two_axis,
-            roll_sigma_rad=self.estimator.roll_sigma_rad,
-        )
+        return self.estimator.knowledge(pivot_enu_m)
 
     def gain(self) -> Gain:
         """Return what each range does to each normal at the working point."""
@@ -165,7 +153,7 @@ class Plan:
             self.mirrors,
             self.sigma_m,
             self.transmitter_sigma_m,
-            self.clock_class,
+            self.waves.clock_class,
             self.estimator,
             reflection=reflection,
         )
@@ -227,29 +215,17 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
     check_unambiguous(transmitter, scenario.wavelength_m)
     estimator = _estimator(scenario, pose)
     noise = noise_of(scenario)
-    order = np.argsort(-scenario.wavelength_m)
-    own, tone_hz = noise.tone_sigma_m[order], scenario.tone_hz[order]
-    wavelength = np.repeat(scenario.wavelength_m[order][:, None], len(transmitter), axis=1)
-    if estimator.carrier and noise.carrier_sigma_m is not None:
-        own = np.vstack([own, noise.carrier_sigma_m])
-        wavelength = np.vstack([wavelength, scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz])
-        tone_hz = np.append(tone_hz, 0.0)
+    own, _ = noise.groups(carrier=estimator.carrier)
     receiver = mirrors.receiver_enu_m
-    thermal = np.broadcast_to(own[:, None], (len(receiver), len(own), receiver.shape[1], len(transmitter)))
-    calibration = np.broadcast_to(own[tone_hz > 0.0], (len(scenario.calibration_receiver), *own[tone_hz > 0.0].shape))
-    if noise.reference_range_m is not None:
-        thermal = thermal * _ranges(transmitter, receiver)[:, None] / noise.reference_range_m
-        there = _ranges(transmitter, scenario.calibration_enu_m) / noise.reference_range_m
-        calibration = calibration * there[:, None]
     plan = Plan(
         scenario=scenario,
         mirrors=mirrors,
         estimator=estimator,
-        wavelength_m=read_only(wavelength),
-        tone_hz=tone_hz,
-        clock_class=_classes(scenario, tone_hz),
-        thermal_m=read_only(np.array(thermal)),
-        calibration_thermal_m=read_only(np.array(calibration)),
+        waves=wavelengths_of(scenario, carrier=estimator.carrier),
+        thermal_m=read_only(own[:, None] * noise.loss(transmitter, receiver)[:, None]),
+        calibration_thermal_m=read_only(
+            noise.tone_sigma_m * noise.loss(transmitter, scenario.calibration_enu_m)[:, None]
+        ),
         converter_share=_converter_share(scenario, receiver),
         by_place=np.empty(0),
         by_transmitter=np.empty(0),
@@ -276,13 +252,6 @@ def _estimator(scenario: Scenario, pose: str) -> Estimator:
             "scenarios"
         )
     return next(iter(kinds))
-
-
-def _classes(scenario: Scenario, tone_hz: FloatArray) -> npt.NDArray[np.int64]:
-    """Clocks: one a tone and one for the carrier; where a reflection is solved for, one for all tones."""
-    if scenario.simulation.ground is not None and scenario.budget.ground != "ignored":
-        return np.where(tone_hz > 0.0, 0, 1).astype(np.int64)
-    return np.arange(len(tone_hz))
 
 
 def _converter_share(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
@@ -317,10 +286,10 @@ def _with_trusted_groups(plan: Plan) -> Plan:
             range_m=distance,
             sigma_m=plan.sigma_m[:, g],
             transmitter_sigma_m=np.broadcast_to(plan.transmitter_sigma_m[g], (n_mirror, len(transmitter))),
-            wavelength_m=plan.wavelength_m[g],
-            clock_class=int(plan.clock_class[g]),
+            wavelength_m=plan.waves.wavelength_m[g],
+            clock_class=int(plan.waves.clock_class[g]),
         )
-        for g in range(len(plan.tone_hz))
+        for g in range(len(plan.waves.tone))
     ]
     solution = solve_ladder(
         transmitter,
@@ -331,14 +300,11 @@ def _with_trusted_groups(plan: Plan) -> Plan:
         knowledge=plan.knowledge(mirrors.pivot_enu_m),
     )
     kept: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=0))
-    tones = kept[plan.tone_hz > 0.0]
     return replace(
         plan,
-        wavelength_m=plan.wavelength_m[kept],
-        tone_hz=plan.tone_hz[kept],
-        clock_class=_classes(plan.scenario, plan.tone_hz[kept]),
+        waves=plan.waves.kept(kept),
         thermal_m=plan.thermal_m[:, kept],
-        calibration_thermal_m=plan.calibration_thermal_m[:, tones],
+        calibration_thermal_m=plan.calibration_thermal_m[:, kept[: plan.waves.n_tone]],
     )
 
 
@@ -346,9 +312,9 @@ def _with_slopes(plan: Plan) -> Plan:
     """Add the slopes of ranges by receivers' and transmitters' places, reflections included where they are solved."""
     transmitter, there = plan.scenario.transmitter_enu_m, plan.scenario.calibration_enu_m
     receiver = plan.mirrors.receiver_enu_m
-    place = np.repeat(_directions(transmitter, receiver)[:, None], len(plan.tone_hz), axis=1)
+    place = np.repeat(_directions(transmitter, receiver)[:, None], len(plan.waves.tone_hz), axis=1)
     tower = -place
-    calibration_place = np.repeat(_directions(transmitter, there)[:, None], plan.n_tone, axis=1)
+    calibration_place = np.repeat(_directions(transmitter, there)[:, None], plan.waves.n_tone, axis=1)
     calibration_tower = -calibration_place
     if plan.reflects:
         ground = plan.scenario.simulation.ground

@@ -59,7 +59,7 @@ def _calibrated(plan: Plan) -> bool:
 
 def _of_calibration(plan: Plan, by_range: FloatArray, root_m: FloatArray) -> Effect:
     """Errors of calibration phases: ``root_m`` (calibration receiver, tone, transmitter, draw) in ranges there [m]."""
-    through = by_range[:, :, : plan.n_tone].sum(axis=3)
+    through = by_range[:, :, : plan.waves.n_tone].sum(axis=3)
     slope = -np.einsum("magt,cgt,cgtx->max", through, plan.calibration_weight, root_m)
     return Effect(slope, common=True)
 
@@ -216,7 +216,7 @@ class Drift:
         if s.budget.drift_time_scale_s is not None:
             scale = s.budget.drift_time_scale_s
             span = scale * (1.0 - np.exp(-age / scale))
-        return np.asarray(rate * np.sqrt(span) * plan.wavelength_m[: plan.n_tone] / (2.0 * np.pi))
+        return np.asarray(rate * np.sqrt(span) * plan.waves.wavelength_m[: plan.waves.n_tone] / (2.0 * np.pi))
 
     def assumed(self, plan: Plan) -> str:
         s = plan.scenario
@@ -228,13 +228,13 @@ class Drift:
         return f"{1e3 * rate:.3g} mrad/√h, calibration {s.budget.calibration_age_s:g} s old{levels}"
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
-        slope = by_range[:, :, : plan.n_tone].sum(axis=3) * self._sigma_m(plan)
+        slope = by_range[:, :, : plan.waves.n_tone].sum(axis=3) * self._sigma_m(plan)
         return [Effect(_flat(slope), common=True)]
 
     def disturb(self, world: World) -> None:
         sigma = self._sigma_m(world.plan)
         drift = sigma * world.normal(world.n_draw, *sigma.shape)
-        world.range_m[:, :, : world.plan.n_tone] += drift[:, None, :, None]
+        world.range_m[:, :, : world.plan.waves.n_tone] += drift[:, None, :, None]
 
 
 class ReceiverPlaces:
@@ -363,7 +363,7 @@ class Multipath:
         assert s.multipath_db is not None
         a = 10.0 ** (s.multipath_db / 20.0)
         speed = plan.scenario.radio.propagation_speed_mps
-        kappa = 2.0 * np.pi * plan.tone_hz[: plan.n_tone] / speed
+        kappa = 2.0 * np.pi * plan.waves.tone_hz[: plan.waves.n_tone] / speed
 
         def mean_cos(k: FloatArray) -> FloatArray:
             return np.asarray(1.0 / (1.0 + (k * s.multipath_excess_m) ** 2))
@@ -376,7 +376,7 @@ class Multipath:
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         root, carrier = self._root_m(plan)
-        n = plan.n_tone
+        n = plan.waves.n_tone
         found = [Effect(_flat(np.einsum("magrt,gx->marxt", by_range[:, :, :n], root)))]
         if by_range.shape[2] > n:
             found.append(Effect(_flat(by_range[:, :, n:] * carrier)))
@@ -390,11 +390,11 @@ class Multipath:
         s = world.plan.scenario.budget
         assert s.multipath_db is not None
         a = 10.0 ** (s.multipath_db / 20.0)
-        world.range_m += _stray_m(world, a, s.multipath_excess_m, world.range_m[:, :, 0].shape, world.plan.tone_hz)
+        waves, shape = world.plan.waves, world.range_m[:, :, 0].shape
+        world.range_m += _stray_m(world, a, s.multipath_excess_m, shape, waves.tone_hz)
         if _calibrated(world.plan):
             shape = world.calibration_m[:, :, 0].shape
-            tones = world.plan.tone_hz[: world.plan.n_tone]
-            world.calibration_m += _stray_m(world, a, s.multipath_excess_m, shape, tones)
+            world.calibration_m += _stray_m(world, a, s.multipath_excess_m, shape, waves.tone_hz[: waves.n_tone])
 
 
 def _stray_m(world: World, a: float, excess_m: float, shape: tuple[int, ...], tone_hz: FloatArray) -> FloatArray:
@@ -466,7 +466,7 @@ class Wavelength:
         found = [self._sigma(plan) * slope]
         if _calibrated(plan):
             there = np.linalg.norm(plan.scenario.calibration_enu_m[:, None] - transmitter, axis=-1)
-            root = np.repeat(there[:, None, :, None], plan.n_tone, axis=1)
+            root = np.repeat(there[:, None, :, None], plan.waves.n_tone, axis=1)
             found.append(_of_calibration(plan, by_range, self._sigma(plan) * root).slope)
         return [Effect(np.sum(found, axis=0), common=True)]
 

@@ -17,8 +17,6 @@ from rfpose.layout.gain import Gain
 
 __all__ = ["BudgetLine", "ErrorBudget", "error_budget", "noise_bound", "target_slope"]
 
-_NOISE = ("thermal noise", "quantisation", "clock", "calibration noise", "calibration survey", "pivot survey")
-
 _BATCH_RANGES = 2_000_000
 """Ranges drawn at once, for memory."""
 
@@ -126,15 +124,11 @@ def error_budget(
 
 
 def noise_bound(plan: Plan) -> FloatArray:
-    """Return the rms angle of each normal (mirror,) [rad] that noise and the solver's own priors leave.
+    """Return the rms angle of each normal (mirror,) [rad] that the solver itself will state.
 
     What `rfpose.layout.maps.normal_map` bounds, for any solver a plan can describe: reflections estimated, too.
     """
-    gain = plan.gain()
-    outputs = _outputs(gain)
-    counted = [s for s in SOURCES if s.name in _NOISE and s.assumed(plan)]
-    total = np.sum([_covariance(s.effects(plan, *outputs), gain) for s in counted], axis=0)
-    return np.asarray(np.sqrt(np.trace(total, axis1=1, axis2=2)))
+    return np.asarray(np.sqrt(np.trace(plan.gain().cov, axis1=1, axis2=2)))
 
 
 def target_slope(plan: Plan, aim_enu_m: npt.ArrayLike | None) -> FloatArray:

@@ -64,7 +64,7 @@ class World:
         self.receiver_mirror_m = np.tile(places, (n_draw, 1, 1, 1))
         self.surveyed_pivot_enu_m = np.tile(mirrors.pivot_enu_m, (n_draw, 1, 1))
         self.range_m = np.zeros((n_draw, n_mirror, n_group, n_receiver, n_transmitter))
-        self.calibration_m = np.zeros((n_draw, n_calibration, plan.n_tone, n_transmitter))
+        self.calibration_m = np.zeros((n_draw, n_calibration, plan.waves.n_tone, n_transmitter))
         self.range_scale = np.zeros(n_draw)
         self.glass_tilt_rad = np.zeros((n_draw, n_mirror, 2))
         self.turn_rate_rad_per_s = np.zeros((n_draw, n_mirror, 2))
@@ -119,7 +119,7 @@ class World:
         """(draw, mirror, group, receiver, transmitter) distances, air and ground included [m]."""
         offset = receiver_enu_m[:, :, :, None] - self.transmitter_enu_m[:, None, None]
         distance = np.linalg.norm(offset, axis=-1) * (1.0 + self.range_scale)[:, None, None, None]
-        out = np.repeat(distance[:, :, None], len(self.plan.tone_hz), axis=2)
+        out = np.repeat(distance[:, :, None], len(self.plan.waves.tone_hz), axis=2)
         for d in range(self.n_draw if self.with_ground else 0):
             reflector = self.plan.reflector(complex(self.coefficient[d]), float(self.ground_height_m[d]))
             shift = self.plan.shift_m(self.transmitter_enu_m[d], receiver_enu_m[d], reflector)
@@ -130,7 +130,7 @@ class World:
         """(draw, calibration receiver, tone, transmitter) [m]."""
         offset = self.calibration_enu_m[:, :, None] - self.transmitter_enu_m[:, None]
         distance = np.linalg.norm(offset, axis=-1) * (1.0 + self.range_scale)[:, None, None]
-        out = np.repeat(distance[:, :, None], self.plan.n_tone, axis=2) + self.calibration_m
+        out = np.repeat(distance[:, :, None], self.plan.waves.n_tone, axis=2) + self.calibration_m
         for d in range(self.n_draw if self.with_ground else 0):
             reflector = self.plan.reflector(complex(self.coefficient[d]), float(self.ground_height_m[d]))
             shift = self.plan.shift_m(self.transmitter_enu_m[d], self.calibration_enu_m[d], reflector, tones_only=True)
@@ -155,7 +155,7 @@ class World:
             range_m.reshape(-1, *range_m.shape[2:]),
             sigma_m=np.tile(plan.sigma_m, (n_draw, 1, 1, 1)),
             transmitter_sigma_m=plan.transmitter_sigma_m,
-            clock_class=plan.clock_class,
+            clock_class=plan.waves.clock_class,
             start_pivot_enu_m=np.tile(plan.mirrors.pivot_enu_m, (n_draw, 1)),
             start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
             knowledge=plan.knowledge(self.surveyed_pivot_enu_m.reshape(-1, 3)),
@@ -167,7 +167,7 @@ class World:
         plan = self.plan
         if not plan.scenario.calibration_receiver:
             return range_m
-        per_m = 2.0 * np.pi / plan.wavelength_m[: plan.n_tone, 0]
+        per_m = 2.0 * np.pi / plan.waves.wavelength_m[: plan.waves.n_tone, 0]
         found = self._calibration_ranges()
         self._average = average_phases(
             np.moveaxis(-found * per_m[:, None], 2, 3),
@@ -175,15 +175,15 @@ class World:
             * np.sqrt(1.0 + plan.converter_share),
             calibration_enu_m=plan.scenario.calibration_enu_m,
             transmitter_enu_m=plan.scenario.transmitter_enu_m,
-            wavelength_m=plan.wavelength_m[: plan.n_tone, 0],
+            wavelength_m=plan.waves.wavelength_m[: plan.waves.n_tone, 0],
             survey_sigma_m=plan.survey_sigma_m,
         )
         electronic = np.moveaxis(self._average.phase_rad, 2, 1)[:, None, :, None] / per_m[:, None, None]
         out = range_m.copy()
-        tones = out[:, :, : plan.n_tone]
+        tones = out[:, :, : plan.waves.n_tone]
         tones += electronic
-        wavelength = plan.wavelength_m[: plan.n_tone, 0][:, None, None]
-        tones -= wavelength * np.rint((tones - range_m[:, :, : plan.n_tone]) / wavelength)
+        wavelength = plan.waves.wavelength_m[: plan.waves.n_tone, 0][:, None, None]
+        tones -= wavelength * np.rint((tones - range_m[:, :, : plan.waves.n_tone]) / wavelength)
         return out
 
     def _assumed_places(self, n_draw: int) -> FloatArray:
@@ -205,10 +205,10 @@ class World:
                 range_m=range_m[:, :, g].reshape(n_row, *range_m.shape[3:]),
                 sigma_m=np.tile(plan.sigma_m[:, g], (n_draw, 1, 1)),
                 transmitter_sigma_m=np.broadcast_to(common[g], (n_row, common.shape[1])),
-                wavelength_m=plan.wavelength_m[g],
-                clock_class=int(plan.clock_class[g]),
+                wavelength_m=plan.waves.wavelength_m[g],
+                clock_class=int(plan.waves.clock_class[g]),
             )
-            for g in range(len(plan.tone_hz))
+            for g in range(len(plan.waves.tone_hz))
         ]
         solution = solve_with_ground(
             plan.scenario.transmitter_enu_m,
@@ -219,6 +219,7 @@ class World:
             start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
             reflectors=(plan.reflector(coefficient),),
             calibration_enu_m=self._calibration_sight(np.repeat(np.arange(self.n_draw)[draws], range_m.shape[1])),
+            tone_count=plan.waves.n_tone,
             knowledge=plan.knowledge(self.surveyed_pivot_enu_m[draws].reshape(-1, 3)),
             free_space=plan.scenario.simulation.path_loss == "free_space",
             min_probability=0.0,
@@ -233,7 +234,7 @@ class World:
         plan, average = self.plan, self._average
         if average is None:
             return None
-        per_m = (2.0 * np.pi / plan.wavelength_m[: plan.n_tone, 0])[:, None]
+        per_m = (2.0 * np.pi / plan.waves.wavelength_m[: plan.waves.n_tone, 0])[:, None]
         return CalibrationSight(
             place_enu_m=plan.scenario.calibration_enu_m,
             frame=draw,
@@ -243,7 +244,7 @@ class World:
     def _solve_independent(self, range_m: FloatArray) -> FloatArray:
         plan, scenario = self.plan, self.plan.scenario
         n_draw, n_mirror, n_group, n_receiver, n_transmitter = range_m.shape
-        per_m = (2.0 * np.pi / plan.wavelength_m[:, 0])[:, None]
+        per_m = (2.0 * np.pi / plan.waves.wavelength_m[:, 0])[:, None]
         phase = np.moveaxis(-range_m * per_m[:, None], 2, -1).reshape(n_draw, -1, n_transmitter, n_group)
         sigma = np.moveaxis(plan.sigma_m * per_m[:, None], 1, -1).reshape(-1, n_transmitter, n_group)
         ranges = range_differences(
@@ -251,7 +252,7 @@ class World:
             np.broadcast_to(sigma, phase.shape),
             np.zeros(phase.shape[2:]),
             (plan.transmitter_sigma_m * per_m).T,
-            plan.wavelength_m[:, 0],
+            plan.waves.wavelength_m[:, 0],
             scenario.transmitter_enu_m,
         )
         poses = solve_poses(

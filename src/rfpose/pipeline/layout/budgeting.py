@@ -51,7 +51,7 @@ class SiteBudget:
             "heliostats": len(self.scenario.heliostat),
             "postures": len(self.posture_names),
             "pose": "rigid" if found.plan.estimator.rigid else "independent",
-            "wavelengths_m": [float(row.mean()) for row in found.plan.wavelength_m],
+            "wavelengths_m": [float(row.mean()) for row in found.plan.waves.wavelength_m],
             "draws": found.n_draw,
             "solutions_failed": found.n_failed,
             "sum": {key: whole[key] for key in ("normal_mrad", "target_m", "worst_heliostat_mrad")},

@@ -17,9 +17,10 @@ from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.files import write_atomically
 from rfpose.layout import maps
 from rfpose.layout.budget import make_plan, noise_bound
-from rfpose.layout.maps import ESTIMATORS, SCENARIO, Study, summarise
+from rfpose.layout.maps import ESTIMATORS, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
+from rfpose.measurement import SCENARIO
 from rfpose.pipeline.layout.site import Posture, Postures, Sight, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures import _mark, _new_figure, _save
 from rfpose.scenario import Scenario, check_scenario

@@ -14,7 +14,6 @@ import numpy as np
 from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.files import write_atomically
-from rfpose.layout import maps
 from rfpose.layout.fields import read_positions
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.optimise import (
@@ -28,6 +27,7 @@ from rfpose.layout.optimise import (
     pareto,
     scenario_with,
 )
+from rfpose.measurement import noise_of
 from rfpose.pipeline.layout.site import Postures, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures import _new_figure, _save
 from rfpose.scenario import Scenario
@@ -302,7 +302,7 @@ def pareto_layout(
 
 def _sigma_m(scenario: Scenario) -> float:
     """Range noise of one transmitter of mean amplitude, all tones together [m]."""
-    tone = maps.noise_of(scenario).tone_sigma_m
+    tone = noise_of(scenario).tone_sigma_m
     return float(np.mean((tone**-2.0).sum(axis=0)) ** -0.5)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from rfpose.dsp.bounds import phase_bound_rad
 from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.layout import maps
-from rfpose.layout.maps import ESTIMATORS, Noise
+from rfpose.layout.maps import ESTIMATORS
+from rfpose.measurement import SCENARIO, Noise, first_snr
 from rfpose.multilat.tones import MAX_TONE, Share, ToneDesign, design_tones
 from rfpose.scenario import Scenario, load_scenario
 
@@ -75,7 +76,7 @@ def _by_carriers(scenario: Scenario, accuracy_mrad: float) -> str:
     if not any(scenario.compares_carriers(h) for h in scenario.heliostat):
         return ""
     try:
-        bound = maps.study_of(scenario, maps.SCENARIO).bound(maps.mirrors_of(scenario))
+        bound = maps.study_of(scenario, SCENARIO).bound(maps.mirrors_of(scenario))
     except (GeometryError, InvalidInputError):
         return ""
     reached = 1e3 * float(np.sqrt(np.mean(bound**2)))
@@ -130,8 +131,7 @@ def design_site_tones(
     """
     _check_wishes(accuracy_mrad, success, band_hz, n_tone)
     scenario = load_scenario(scenario_path)
-    if tone_snr_db is not None:
-        maps.noise_of(scenario, tone_snr_db=tone_snr_db)
+    snr = first_snr(scenario, tone_snr_db)
     try:
         transmitter = maps.check_site(scenario.transmitter_enu_m)
         mirrors = maps.mirrors_of(scenario)
@@ -142,10 +142,9 @@ def design_site_tones(
         apart = np.linalg.norm(transmitter[:, None] - transmitter, axis=2)
         carriers = np.sort(scenario.carrier_hz)
         spacing = float(np.min(np.diff(carriers))) if len(carriers) > 1 else 2.0 * np.inf
-        snr_db = scenario.simulation.tone_snr_db if tone_snr_db is None else tone_snr_db
         tones = design_tones(
             reach_m=float(apart.max(axis=1).min()),
-            phase_sigma_rad=float(phase_bound_rad(scenario.radio.frame_samples, 10.0 ** (snr_db / 10.0))),
+            phase_sigma_rad=float(phase_bound_rad(scenario.radio.frame_samples, snr)),
             range_sigma_m=1e-3 * accuracy_mrad / rad_per_m,
             success=success,
             band_hz=(0.0, spacing / 2.0) if band_hz is None else band_hz,

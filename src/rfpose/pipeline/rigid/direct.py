@@ -66,7 +66,7 @@ def solve_direct(stages: Stages, group: MirrorGroup) -> Found:
     Where a receiver's fix may be on either side of the transmitters' plane, the mirror is solved from both.
     """
     places, start, rot, phases = inputs_of(stages, group)
-    known = group.knowledge(stages.scenario, len(stages.tones.frame_start_index))
+    known = group.knowledge(len(stages.tones.frame_start_index))
     begin = _Begin(places=places, phases=phases, pivot=start, rot=rot, known=known)
     status = stages.fixes.status[:, group.rows].reshape(len(places), -1)
     twofold = np.flatnonzero((status == FixStatus.AMBIGUOUS).any(axis=1))

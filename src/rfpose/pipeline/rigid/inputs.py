@@ -28,7 +28,7 @@ def inputs_of(stages: Stages, group: MirrorGroup) -> tuple[FloatArray, FloatArra
     located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
     start, rot = align_points(places, located)
     phases = observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group)
-    known = group.knowledge(stages.scenario, n_frame)
+    known = group.knowledge(n_frame)
     if stages.choice.reflection == "none":
         phases = [_without_vague_calibration(o, known) for o in phases]
     weak = np.flatnonzero(_are_vague(stages, group, places))

@@ -210,7 +210,7 @@ class Tables:
             by_frame(np.where(observed, poses.clock_m, 0.0)),
             by_frame(whole),
             time_s=time_s,
-            drift_m_per_sqrt_s=group.drift_m_per_sqrt_s(scenario),
+            drift_m_per_sqrt_s=group.estimator.delay_drift_m_per_sqrt_s or 0.0,
             observed=by_frame(observed),
         )
         n_receiver = group.rows.shape[1]

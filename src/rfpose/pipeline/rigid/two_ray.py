@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp.calibration import frame_times, phase_average
+from rfpose.measurement import reflectors_of
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.ground import CalibrationSight, GroundSolution, GroundStatus, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import Knowledge, RigidPoses, solve_rigid
 from rfpose.multilat.rigid.integers import IntegerMethod, Observation
-from rfpose.pipeline.choice import reflectors_of
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
     calibration_sight,
@@ -54,7 +54,7 @@ def solve_two_ray(stages: Stages, group: MirrorGroup) -> Found:
     scenario = stages.scenario
     n_frame, n_helio = len(stages.tones.frame_start_index), len(group.column)
     places, start, rot, phases = inputs_of(stages, group)
-    known = group.knowledge(scenario, n_frame)
+    known = group.knowledge(n_frame)
     surveyed = np.tile(group.pivot_enu_m, (n_frame, 1))
     start, rot = _better_start(scenario, places, phases, start, rot, surveyed, known)
     row = np.arange(n_frame * n_helio).reshape(n_frame, n_helio)
