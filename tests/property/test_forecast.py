@@ -80,7 +80,6 @@ def drawn(rng: np.random.Generator, *, ground: str, centre_hz: float) -> Scenari
     if ground != "none":
         part = [COEFFICIENT.real, COEFFICIENT.imag]
         simulation["ground"] = {"coefficient": part, "height_m": GROUND_M}
-        data["budget"] = {"ground": ground}
         data["reflection"] = {
             "model": "estimate" if ground == "estimated" else "known",
             "height_m": GROUND_M,

@@ -6,12 +6,19 @@ Whoever solves mirrors, bounds them or forecasts them takes it from here, so tha
 
 from rfpose.measurement.estimator import SCENARIO, Estimator, estimator_of, estimators_of
 from rfpose.measurement.noise import Noise, calibration_sigma_m, first_snr, noise_of, phase_sigma_rad
-from rfpose.measurement.reflection import check_reflectors, reflectors_of, simulated_ground
+from rfpose.measurement.reflection import (
+    GroundHandling,
+    check_reflectors,
+    ground_handling,
+    reflectors_of,
+    simulated_ground,
+)
 from rfpose.measurement.wavelengths import Wavelengths, clock_classes, wavelengths_of
 
 __all__ = [
     "SCENARIO",
     "Estimator",
+    "GroundHandling",
     "Noise",
     "Wavelengths",
     "calibration_sigma_m",
@@ -20,6 +27,7 @@ __all__ = [
     "estimator_of",
     "estimators_of",
     "first_snr",
+    "ground_handling",
     "noise_of",
     "phase_sigma_rad",
     "reflectors_of",

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from rfpose.errors import GeometryError
 from rfpose.multilat.ground import Reflector, Surface
 from rfpose.multilat.ground.model import heights_m
 from rfpose.scenario import Scenario
 
-__all__ = ["check_reflectors", "reflectors_of", "simulated_ground"]
+__all__ = ["GroundHandling", "check_reflectors", "ground_handling", "reflectors_of", "simulated_ground"]
+
+GroundHandling = Literal["ignored", "known", "estimated"]
+"""What a solver does about a ground that reflects."""
 
 
 def reflectors_of(scenario: Scenario, model: str) -> tuple[Reflector, ...]:
@@ -68,6 +73,16 @@ def check_reflectors(scenario: Scenario, reflectors: tuple[Reflector, ...]) -> N
                         "reflected there; move the plane (`height_m`, `point_enu_m`), turn its `normal_enu` around, or "
                         "leave it out"
                     )
+
+
+def ground_handling(scenario: Scenario) -> GroundHandling:
+    """Return what the solver of a budget does about the ground: by ``[budget] ground``, else as process would do."""
+    if scenario.budget.ground is not None:
+        return scenario.budget.ground
+    table = scenario.reflection
+    if table.model == "none":
+        return "ignored"
+    return "estimated" if table.model == "estimate" or table.scaled else "known"
 
 
 def simulated_ground(

@@ -23,8 +23,8 @@ class Budget(Record):
     """Time since the transmitters' phases were measured; 0: calibration receivers hear every frame."""
     drift_time_scale_s: Positive | None = None
     """Beyond this the drift of a transmitter's phase levels off; default: a random walk without end."""
-    ground: Literal["ignored", "known", "estimated"] = "ignored"
-    """What the solver does about ``[simulation.ground]``."""
+    ground: Literal["ignored", "known", "estimated"] | None = None
+    """What the solver does about ``[simulation.ground]``; default: as ``[reflection]`` has it."""
     ground_coefficient_sigma: NonNegative = 0.02
     """Of real and imaginary part, where the coefficient is known."""
     ground_height_sigma_m: NonNegative = 0.005

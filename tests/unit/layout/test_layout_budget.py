@@ -177,6 +177,23 @@ def test_equal_seeds_equal_draws():
     assert (first != other).all()
 
 
+@pytest.mark.parametrize(
+    ("table", "ground"),
+    [
+        ({"model": "none"}, "ignored"),
+        ({"model": "estimate"}, "estimated"),
+        ({"model": "known", "coefficient": (-0.3, 0.1)}, "known"),
+        ({"model": "fresnel", "permittivity": 4.0}, "known"),
+        ({"model": "fresnel", "permittivity": 4.0, "scaled": True}, "estimated"),
+    ],
+)
+def test_the_budget_models_the_ground_as_process_does(table, ground):
+    scenario = two_tones(**REFLECTING, reflection=table)
+    assert plan_of(scenario).ground == ground
+    assert plan_of(scenario, pose="independent").ground == "ignored"
+    assert plan_of(two_tones(**REFLECTING, reflection=table, budget={"ground": "known"})).ground == "known"
+
+
 def test_what_cannot_be_budgeted_is_refused():
     with pytest.raises(InvalidInputError, match="rigid or independent"):
         plan_of(site(), pose="loose")

@@ -13,9 +13,11 @@ from rfpose.layout.gain import Gain, Reflection, normal_gain
 from rfpose.layout.maps import Mirrors, check_site
 from rfpose.measurement import (
     Estimator,
+    GroundHandling,
     Wavelengths,
     calibration_sigma_m,
     estimators_of,
+    ground_handling,
     noise_of,
     simulated_ground,
     wavelengths_of,
@@ -42,6 +44,8 @@ class Plan:
         The site, and the expected poses of its mirrors.
     estimator
         As `rfpose process` would solve them.
+    ground
+        What the solver does about a ground that reflects.
     waves
         The wavelengths used; a group is one of them.
     thermal_m : (mirror, group, receiver, transmitter)
@@ -59,6 +63,7 @@ class Plan:
     scenario: Scenario
     mirrors: Mirrors
     estimator: Estimator
+    ground: GroundHandling
     waves: Wavelengths
     thermal_m: FloatArray
     calibration_thermal_m: FloatArray
@@ -101,12 +106,12 @@ class Plan:
     @property
     def reflects(self) -> bool:
         """Whether the ground reflects and the solver knows it."""
-        return self.scenario.simulation.ground is not None and self.scenario.budget.ground != "ignored"
+        return self.scenario.simulation.ground is not None and self.ground != "ignored"
 
     @property
     def estimates_ground(self) -> bool:
         """Whether the solver finds the reflection's coefficient itself."""
-        return self.reflects and self.scenario.budget.ground == "estimated"
+        return self.reflects and self.ground == "estimated"
 
     def reflector(self, coefficient: complex | None, height_offset_m: float = 0.0) -> Reflector:
         """Return the ground with a coefficient (None: to be estimated), at another height."""
@@ -221,6 +226,7 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
         scenario=scenario,
         mirrors=mirrors,
         estimator=estimator,
+        ground=ground_handling(scenario) if estimator.rigid or scenario.budget.ground else "ignored",
         waves=wavelengths_of(scenario, carrier=estimator.carrier),
         thermal_m=read_only(own[:, None] * noise.loss(transmitter, receiver)[:, None]),
         calibration_thermal_m=read_only(

@@ -312,10 +312,10 @@ class GroundReflection:
         if ground is None:
             return ""
         value = complex(*ground.coefficient)
-        text = f"coefficient {value.real:g}{value.imag:+g}j, {settings.ground}"
-        if settings.ground == "ignored":
+        text = f"coefficient {value.real:g}{value.imag:+g}j, {plan.ground}"
+        if plan.ground == "ignored":
             return text
-        if settings.ground == "known":
+        if plan.ground == "known":
             text += f" to {settings.ground_coefficient_sigma:g}"
         return f"{text}, height to {1e3 * settings.ground_height_sigma_m:g} mm"
 
