@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rfpose import geometry
 from rfpose.multilat.ground import GroundSolution, Reflector, Surface, fresnel_coefficient, solve_with_ground
-from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
-from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
 from rfpose.pipeline.bench_multilat import TRANSMITTER_ENU_M
 
 SPEED_MPS = 299_792_458.0
@@ -49,13 +48,15 @@ class Measured:
     def solve(self, reflectors: tuple[Reflector, ...] = (Reflector(),)) -> GroundSolution:
         """Solve from the starts."""
         return solve_with_ground(
-            TRANSMITTER_ENU_M,
-            PLACES_M,
-            self.observations,
+            MirrorProblem.of_observations(
+                TRANSMITTER_ENU_M,
+                PLACES_M,
+                self.observations,
+                start_pivot_enu_m=np.asarray(self.knowledge.pivot_enu_m),
+                start_rot_enu_from_mirror=self.start_rot,
+                knowledge=self.knowledge,
+            ),
             carrier_rf_hz=self.carrier_rf_hz,
-            start_pivot_enu_m=np.asarray(self.knowledge.pivot_enu_m),
-            start_rot_enu_from_mirror=self.start_rot,
-            knowledge=self.knowledge,
             reflectors=reflectors,
         )
 
@@ -66,14 +67,16 @@ class Measured:
     def bound_mrad(self) -> float:
         """Bound without any reflection."""
         cov = rigid_bound(
-            TRANSMITTER_ENU_M,
-            PLACES_M,
-            self.pivot_true,
-            self.rot_true,
-            sigma_m=np.stack([o.sigma_m for o in self.observations], axis=1),
-            transmitter_sigma_m=np.inf,
-            clock_class=[o.clock_class for o in self.observations],
-            knowledge=self.knowledge,
+            MirrorProblem.expected(
+                TRANSMITTER_ENU_M,
+                PLACES_M,
+                self.pivot_true,
+                self.rot_true,
+                sigma_m=np.stack([o.sigma_m for o in self.observations], axis=1),
+                transmitter_sigma_m=np.inf,
+                clock_class=[o.clock_class for o in self.observations],
+                knowledge=self.knowledge,
+            )
         )
         return 1e3 * rms(tilt_sigma_rad(cov, self.rot_true[:, :, 2]))
 
@@ -139,6 +142,7 @@ def measure(
                 transmitter_sigma_m=free,
                 wavelength_m=2 * np.pi / k,
                 clock_class=1,
+                carrier=True,
             )
         )
     off = 0.1 * geometry.unit(rng.standard_normal((n_mirror, 3)))

@@ -18,9 +18,8 @@ from rich.table import Table
 
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.exclusion import _problem
-from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
-from rfpose.multilat.rigid import Knowledge, solve_rigid
+from rfpose.multilat.integrity.hypotheses import Problem, judge, limit, noncentrality
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
     [
@@ -52,11 +51,11 @@ class Field:
 
     def solve(self, z: np.ndarray, **more: float) -> GuardedPoses:
         """Solve with tests."""
-        return solve_with_integrity(TRANSMITTER, PLACES, z, **self.settings, **more)
+        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), **more)
 
     def plain(self, z: np.ndarray) -> np.ndarray:
         """Errors of the normal without any test [rad]."""
-        return self.error(solve_rigid(TRANSMITTER, PLACES, z, **self.settings).normal_enu)
+        return self.error(solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings)).normal_enu)
 
     def error(self, normal: np.ndarray) -> np.ndarray:
         """Angle between found and true normal [rad]."""
@@ -173,7 +172,9 @@ def table_of_chosen(n: int, seed: int) -> Table:
             found = mirrors.solve(z, false_alarm=1e-3)
             out = (found.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) & found.ok
             out &= ~found.prior_rejected.any(axis=1)
-            left = solve_rigid(TRANSMITTER, PLACES, np.where(found.used[:, None], z, np.nan), **mirrors.settings)
+            left = solve_rigid(
+                MirrorProblem.of(TRANSMITTER, PLACES, np.where(found.used[:, None], z, np.nan), **mirrors.settings)
+            )
             error = mirrors.error(found.poses.normal_enu)[out]
             ratios = [error / poses.tilt_sigma_rad[out] for poses in (left, found.poses)]
             table.add_row(
@@ -192,13 +193,13 @@ def worst_direction(n: int, seed: int, *, shared: bool) -> tuple[Field, np.ndarr
     mirrors = field(n, np.random.default_rng(seed), shared=shared, noise=0.0)
     who = mirrors.solve(mirrors.z).worst_transmitter
     rng = np.random.default_rng(seed + 1)
-    problem = _problem(TRANSMITTER, PLACES, mirrors.z, SIGMA, SIGMA, [0], mirrors.settings["knowledge"])
+    problem = Problem.of(MirrorProblem.of(TRANSMITTER, PLACES, mirrors.z, **mirrors.settings))
     at = np.arange(n)
     best, best_slope = np.zeros_like(mirrors.z), np.zeros(n)
     for _ in range(40):
         error = np.zeros_like(mirrors.z)
         error[at, 0, :, who] = SIGMA * rng.standard_normal((n, 3))
-        poses = solve_rigid(TRANSMITTER, PLACES, mirrors.z + error, **mirrors.settings)
+        poses = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, mirrors.z + error, **mirrors.settings))
         verdict = judge(replace(problem, z=mirrors.z + error), poses)
         stat = verdict.stat[at, who]
         slope = mirrors.error(poses.normal_enu) / np.sqrt(stat)

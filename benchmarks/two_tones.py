@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from wrong_fix import PLACES_M, SPEED_MPS, TRANSMITTER_ENU_M, draw_mirrors
 
-from rfpose.multilat.rigid import rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorProblem, rigid_bound, tilt_sigma_rad
 
 N_MIRROR = 2000
 SIGMA_RAD = 1.58e-5
@@ -24,13 +24,15 @@ def normal_rms_mrad(tones_hz: tuple[float, ...], sigma_rad: tuple[float, ...]) -
         np.full((N_MIRROR, 3, 10), SPEED_MPS / f / (2 * np.pi) * s) for f, s in zip(tones_hz, sigma_rad, strict=True)
     ]
     cov = rigid_bound(
-        TRANSMITTER_ENU_M,
-        np.tile(PLACES_M, (N_MIRROR, 1, 1)),
-        pivot,
-        rot,
-        sigma_m=np.stack(own, axis=1),
-        transmitter_sigma_m=1e-9,
-        clock_class=np.arange(len(tones_hz)),
+        MirrorProblem.expected(
+            TRANSMITTER_ENU_M,
+            np.tile(PLACES_M, (N_MIRROR, 1, 1)),
+            pivot,
+            rot,
+            sigma_m=np.stack(own, axis=1),
+            transmitter_sigma_m=1e-9,
+            clock_class=np.arange(len(tones_hz)),
+        )
     )
     return float(1e3 * np.sqrt(np.mean(tilt_sigma_rad(cov, rot[:, :, 2]) ** 2)))
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
-from rfpose.multilat.rigid.integers import IntegerMethod, Observation, RigidSolution, solve_ladder
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid.integers import IntegerMethod, RigidSolution, solve_ladder
 
 Array = NDArray[np.float64]
 
@@ -130,7 +130,7 @@ def is_wrong(solution: RigidSolution, observations: list[Observation], whole: li
     """Mirrors with a wrong integer, the common ones apart that clocks and transmitters take up."""
     wrong = np.zeros(len(whole[0]), np.bool_)
     for k in range(1, len(observations)):
-        turns = np.rint((solution.range_m[k] - whole[k]) / observations[k].wavelength_m)
+        turns = np.rint((solution.range_m[:, k] - whole[k]) / observations[k].wavelength_m)
         if np.isinf(observations[k].transmitter_sigma_m).any():
             off = turns - turns[:, :1]
         else:
@@ -152,24 +152,28 @@ def run(case: Case, n: int, seed: int) -> Count:
         observations, whole = observe(rng, case, np.linalg.norm(receiver[:, :, None] - TRANSMITTER_ENU_M, axis=-1))
         begun = time.perf_counter()
         found = solve_ladder(
-            TRANSMITTER_ENU_M,
-            places,
-            observations,
-            start_pivot_enu_m=pivot + 0.3 * rng.standard_normal((CHUNK, 3)),
-            start_rot_enu_from_mirror=rot @ turn,
-            knowledge=known,
+            MirrorProblem.of_observations(
+                TRANSMITTER_ENU_M,
+                places,
+                observations,
+                start_pivot_enu_m=pivot + 0.3 * rng.standard_normal((CHUNK, 3)),
+                start_rot_enu_from_mirror=rot @ turn,
+                knowledge=known,
+            ),
             wrong_risk=ANY_RISK,
         )
         count.seconds += time.perf_counter() - begun
         cov = rigid_bound(
-            TRANSMITTER_ENU_M,
-            places,
-            pivot,
-            rot,
-            sigma_m=np.stack([o.sigma_m for o in observations], axis=1),
-            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in observations], axis=1),
-            clock_class=np.arange(len(observations)),
-            knowledge=known,
+            MirrorProblem.expected(
+                TRANSMITTER_ENU_M,
+                places,
+                pivot,
+                rot,
+                sigma_m=np.stack([o.sigma_m for o in observations], axis=1),
+                transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in observations], axis=1),
+                clock_class=np.arange(len(observations)),
+                knowledge=known,
+            )
         )
         wrong = is_wrong(found, observations, whole)
         with np.errstate(invalid="ignore"):

@@ -17,9 +17,16 @@ import numpy as np
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.ground import Reflector, range_shift_m, solve_with_ground
 from rfpose.multilat.integrity import IntegrityStatus, solve_with_integrity
-from rfpose.multilat.rigid import Knowledge, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import (
+    Knowledge,
+    MirrorProblem,
+    Observation,
+    full_covariance,
+    rigid_bound,
+    solve_rigid,
+    tilt_sigma_rad,
+)
 from rfpose.multilat.rigid.delays import learn_delays
-from rfpose.multilat.rigid.integers import Observation
 from rfpose.scenario import load_scenario
 
 mpl.use("Agg")
@@ -68,14 +75,16 @@ def bound(pivot: np.ndarray, rot: np.ndarray, sigma_m: list[float], known: Knowl
     sigma = np.broadcast_to(np.array(sigma_m)[None, :, None, None], (n, len(sigma_m), 3, 10))
     common = np.broadcast_to(np.array([1e-7, np.inf])[None, : len(sigma_m), None], (n, len(sigma_m), 10))
     cov = rigid_bound(
-        TRANSMITTER,
-        PLACES,
-        pivot,
-        rot,
-        sigma_m=sigma,
-        transmitter_sigma_m=common,
-        clock_class=np.arange(len(sigma_m)),
-        knowledge=known,
+        MirrorProblem.expected(
+            TRANSMITTER,
+            PLACES,
+            pivot,
+            rot,
+            sigma_m=sigma,
+            transmitter_sigma_m=common,
+            clock_class=np.arange(len(sigma_m)),
+            knowledge=known,
+        )
     )
     return tilt_sigma_rad(cov, rot[:, :, 2])
 
@@ -116,7 +125,7 @@ def delays(directory: Path) -> None:
         "transmitter_sigma_m": 1e-7,
         "clock_class": [0],
     }
-    whole = full_covariance(TRANSMITTER, PLACES, pivot, rot, **common)
+    whole = full_covariance(MirrorProblem.expected(TRANSMITTER, PLACES, pivot, rot, **common))
     one = rms(bound(pivot, rot, [RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0)))
     three = rms(tilt_sigma_rad(whole[:, :6, :6], rot[:, :, 2]))
     figure, axes = plt.subplots(figsize=(6.4, 3.8))
@@ -132,12 +141,9 @@ def delays(directory: Path) -> None:
             delay = delay + rate * np.sqrt(60.0) * rng.standard_normal(delay.shape)
             z = distance + delay[:, :, None] + RANGE_SIGMA_M * rng.standard_normal(distance.shape)
             solved = solve_rigid(
-                TRANSMITTER,
-                PLACES,
-                z[:, None],
-                start_pivot_enu_m=pivot,
-                start_rot_enu_from_mirror=rot,
-                **common,
+                MirrorProblem.of(
+                    TRANSMITTER, PLACES, z[:, None], start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, **common
+                )
             )
             for name, values in (
                 ("pivot", solved.pivot_enu_m),
@@ -177,13 +183,15 @@ def edge() -> None:
     pivot, rot, n_frame = np.array([[100.0, 0.0, 0.0]]), rot_enu_from_mirror(np.array([[-1.0, 0.0, 1.0]])), 50
     one = bound(pivot, rot, [RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0))[0]
     whole = full_covariance(
-        TRANSMITTER,
-        PLACES,
-        pivot,
-        rot,
-        sigma_m=np.full((1, 1, 3, 10), RANGE_SIGMA_M),
-        transmitter_sigma_m=1e-7,
-        clock_class=[0],
+        MirrorProblem.expected(
+            TRANSMITTER,
+            PLACES,
+            pivot,
+            rot,
+            sigma_m=np.full((1, 1, 3, 10), RANGE_SIGMA_M),
+            transmitter_sigma_m=1e-7,
+            clock_class=[0],
+        )
     )
     for rate_ps, interval_s in ((0.0, 60.0), (1.0, 1.0), (1.0, 10.0), (1.0, 60.0)):
         learned = learn_delays(
@@ -232,14 +240,11 @@ def reflection(directory: Path) -> None:
             )
             for q in range(2)
         ]
-        common = {
-            "carrier_rf_hz": carrier_hz,
-            "start_pivot_enu_m": pivot,
-            "start_rot_enu_from_mirror": start,
-            "knowledge": known,
-        }
-        ignored = solve_with_ground(TRANSMITTER, PLACES, phases, reflectors=(), **common)
-        estimated = solve_with_ground(TRANSMITTER, PLACES, phases, **common)
+        problem = MirrorProblem.of_observations(
+            TRANSMITTER, PLACES, phases, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=start, knowledge=known
+        )
+        ignored = solve_with_ground(problem, carrier_rf_hz=carrier_hz, reflectors=())
+        estimated = solve_with_ground(problem, carrier_rf_hz=carrier_hz)
         for name, found in (("ignored", ignored), ("estimated", estimated)):
             off = angle_between_rad(found.poses.normal_enu, rot[:, :, 2])
             error[name].append(1e3 * rms(off[np.isfinite(off)]))
@@ -293,8 +298,8 @@ def integrity(directory: Path) -> None:
         z = distance + RANGE_SIGMA_M * (rng.standard_normal(distance.shape) + rng.standard_normal((n, 1, 10)))
         who = rng.integers(0, 10, n)
         z[np.arange(n), :, who] += size * RANGE_SIGMA_M * rng.choice([-1.0, 1.0], (n, 3))
-        raw = solve_rigid(TRANSMITTER, PLACES, z[:, None], **common)
-        safe = solve_with_integrity(TRANSMITTER, PLACES, z[:, None], false_alarm=1e-3, **common)
+        raw = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z[:, None], **common))
+        safe = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z[:, None], **common), false_alarm=1e-3)
         ruined = angle_between_rad(raw.normal_enu, rot[:, :, 2])
         plain.append(rms(ruined[np.isfinite(ruined)]))
         off = angle_between_rad(safe.poses.normal_enu, rot[:, :, 2])

@@ -13,8 +13,8 @@ from scipy.stats import chi2, kstest
 
 from rfpose import geometry
 from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.multilat import PoseStatus
 from rfpose.multilat.ground import (
-    GroundStatus,
     Reflector,
     Surface,
     fresnel_coefficient,
@@ -23,8 +23,7 @@ from rfpose.multilat.ground import (
     solve_with_ground,
 )
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
-from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
-from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
 
 SPEED = 299_792_458.0
@@ -46,18 +45,15 @@ class Field:
     rot_true: np.ndarray
 
     def solve(self, observations=None, **settings):
-        return solve_with_ground(
+        mirrors = MirrorProblem.of_observations(
             TRANSMITTER,
             PLACES,
             self.observations if observations is None else observations,
-            **{
-                "carrier_rf_hz": self.carrier_rf_hz,
-                "start_pivot_enu_m": self.knowledge.pivot_enu_m,
-                "start_rot_enu_from_mirror": self.start_rot,
-                "knowledge": self.knowledge,
-                **settings,
-            },
+            start_pivot_enu_m=settings.pop("start_pivot_enu_m", self.knowledge.pivot_enu_m),
+            start_rot_enu_from_mirror=settings.pop("start_rot_enu_from_mirror", self.start_rot),
+            knowledge=settings.pop("knowledge", self.knowledge),
         )
+        return solve_with_ground(mirrors, **{"carrier_rf_hz": self.carrier_rf_hz, **settings})
 
     def errors_rad(self, solution):
         return geometry.angle_between_rad(solution.poses.normal_enu, self.rot_true[:, :, 2])
@@ -65,14 +61,16 @@ class Field:
     def bound_rad(self):
         """Of the normal, no reflection."""
         cov = rigid_bound(
-            TRANSMITTER,
-            PLACES,
-            self.pivot_true,
-            self.rot_true,
-            sigma_m=np.stack([o.sigma_m for o in self.observations], axis=1),
-            transmitter_sigma_m=np.inf,
-            clock_class=[o.clock_class for o in self.observations],
-            knowledge=self.knowledge,
+            MirrorProblem.expected(
+                TRANSMITTER,
+                PLACES,
+                self.pivot_true,
+                self.rot_true,
+                sigma_m=np.stack([o.sigma_m for o in self.observations], axis=1),
+                transmitter_sigma_m=np.inf,
+                clock_class=[o.clock_class for o in self.observations],
+                knowledge=self.knowledge,
+            )
         )
         return tilt_sigma_rad(cov, self.rot_true[:, :, 2])
 
@@ -141,6 +139,7 @@ def make_field(
                 transmitter_sigma_m=np.full((n_mirror, 10), np.inf),
                 wavelength_m=2 * np.pi / k,
                 clock_class=1,
+                carrier=True,
             )
         )
     off = off_rad * geometry.unit(rng.standard_normal((n_mirror, 3)))
@@ -178,7 +177,7 @@ def test_normals_are_as_good_as_without_reflection(rf_hz, carrier):
         coefficient = random_coefficient(seed)
         field = make_field(seed, 80, rf_hz, coefficient, carrier=carrier)
         solution = field.solve()
-        assert (solution.status == GroundStatus.OK).all()
+        assert (solution.status == PoseStatus.OK).all()
         assert solution.fixed.all()
         ratio = np.sqrt(np.mean(field.errors_rad(solution) ** 2) / np.mean(field.bound_rad() ** 2))
         assert ratio <= 1.3
@@ -201,7 +200,7 @@ def test_a_reflection_that_matters_is_reported(largest):
         bad = ~(field.errors_rad(ignoring) <= 3.0 * ignoring.poses.tilt_sigma_rad)
         hurt += bad.sum()
         reported += (solution.probability_direct[bad] < 1e-3).sum()
-        np.testing.assert_array_equal(ignoring.probability < 1e-6, ignoring.status == GroundStatus.RESIDUAL)
+        np.testing.assert_array_equal(ignoring.probability < 1e-6, ignoring.status == PoseStatus.UNEXPLAINED)
     assert hurt > 100
     assert reported >= 0.99 * hurt
 
@@ -218,7 +217,7 @@ def test_without_reflection_none_is_claimed():
 def test_one_mirror_is_enough_for_the_coefficient():
     field = make_field(6, 1, 100e6, -0.3 + 0.1j, carrier=True)
     solution = field.solve()
-    assert solution.status[0] == GroundStatus.OK
+    assert solution.status[0] == PoseStatus.OK
     assert field.errors_rad(solution)[0] < 4.0 * solution.poses.tilt_sigma_rad[0]
     assert abs(solution.coefficient[0] - (-0.3 + 0.1j)) < 5.0 * np.sqrt(np.trace(solution.coefficient_cov))
 
@@ -226,7 +225,7 @@ def test_one_mirror_is_enough_for_the_coefficient():
 def test_clock_for_each_receiver():
     field = make_field(7, 80, 100e6, 0.25j, shared=False)
     solution = field.solve()
-    assert (solution.status == GroundStatus.OK).all()
+    assert (solution.status == PoseStatus.OK).all()
     assert_scatter_is_as_stated(field, solution)
     assert np.sqrt(np.mean(field.errors_rad(solution) ** 2) / np.mean(field.bound_rad() ** 2)) <= 1.3
 
@@ -235,7 +234,7 @@ def test_reflections_at_the_calibration_receivers_are_counted():
     calibration = np.array([[15.0, -20.0, 2.5], [-35.0, 40.0, 3.0]])
     field = make_field(8, 40, 100e6, -0.3 + 0.1j, calibration=calibration)
     solution = field.solve(calibration_enu_m=calibration)
-    assert (solution.status == GroundStatus.OK).all()
+    assert (solution.status == PoseStatus.OK).all()
     assert_scatter_is_as_stated(field, solution)
 
 
@@ -255,7 +254,7 @@ def test_tilted_plane_and_fresnel_surface_with_known_constants():
         plane=plane,
     )
     solution = field.solve(reflectors=[plane])
-    assert (solution.status == GroundStatus.OK).all()
+    assert (solution.status == PoseStatus.OK).all()
     assert_scatter_is_as_stated(field, solution)
     scaled = field.solve(reflectors=[replace(plane, scaled=True)])
     assert abs(scaled.coefficient[0] - 1.0) < 5.0 * np.sqrt(np.trace(scaled.coefficient_cov))
@@ -266,7 +265,7 @@ def test_wrong_plane_is_not_silent():
     solution = field.solve()
     wrong = field.errors_rad(solution) > 3.0 * solution.poses.tilt_sigma_rad
     assert wrong.any()
-    assert (solution.status[wrong] == GroundStatus.RESIDUAL).mean() > 0.99
+    assert (solution.status[wrong] == PoseStatus.UNEXPLAINED).mean() > 0.99
 
 
 def test_bad_rows_do_not_stop_the_rest():
@@ -283,24 +282,24 @@ def test_bad_rows_do_not_stop_the_rest():
     solution = field.solve(lost, start_pivot_enu_m=pivot)
     expected = np.zeros(30)
     expected[4], expected[5], expected[6] = (
-        GroundStatus.TOO_FEW,
-        GroundStatus.NO_START,
-        GroundStatus.BEHIND_REFLECTOR,
+        PoseStatus.UNKNOWNS,
+        PoseStatus.TOO_FEW,
+        PoseStatus.BEHIND_REFLECTOR,
     )
     np.testing.assert_array_equal(solution.status, expected)
     good = expected == 0
     assert np.isnan(solution.poses.rot_enu_from_mirror[~good]).all()
     assert np.all(field.errors_rad(solution)[good] < 6.0 * solution.poses.tilt_sigma_rad[good])
-    assert "below the ground" in GroundStatus(6 - 1).reason
+    assert "below the ground" in PoseStatus.BEHIND_REFLECTOR.reason
 
 
 def test_no_mirror_with_a_start_or_a_measurement():
     field = make_field(13, 4, 100e6, 0.3, carrier=True)
     solution = field.solve(start_rot_enu_from_mirror=np.full((4, 3, 3), np.nan))
-    assert (solution.status == GroundStatus.NO_START).all()
+    assert (solution.status == PoseStatus.TOO_FEW).all()
     assert np.isnan(solution.coefficient_cov).all()
     silent = [replace(o, range_m=np.full(o.range_m.shape, np.nan)) for o in field.observations]
-    assert (field.solve(silent).status == GroundStatus.TOO_FEW).all()
+    assert (field.solve(silent).status == PoseStatus.UNKNOWNS).all()
 
 
 def test_callers_mistakes_are_refused_in_words():
@@ -347,21 +346,23 @@ def test_a_bad_transmitter_is_left_out_where_the_ground_reflects():
 def test_the_bound_with_estimated_coefficients_is_the_solutions_covariance(calibration):
     field = make_field(32, 20, 100e6, -0.3 + 0.1j, calibration=calibration)
     solution = field.solve(**({} if calibration is None else {"calibration_enu_m": calibration}))
-    assert np.all(solution.status == GroundStatus.OK)
+    assert np.all(solution.status == PoseStatus.OK)
     cov = ground_bound(
-        TRANSMITTER,
-        PLACES,
-        field.pivot_true,
-        field.rot_true,
-        sigma_m=np.stack([o.sigma_m for o in field.observations], axis=1),
-        transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in field.observations], axis=1),
-        clock_class=[o.clock_class for o in field.observations],
+        MirrorProblem.expected(
+            TRANSMITTER,
+            PLACES,
+            field.pivot_true,
+            field.rot_true,
+            sigma_m=np.stack([o.sigma_m for o in field.observations], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in field.observations], axis=1),
+            clock_class=[o.clock_class for o in field.observations],
+            knowledge=field.knowledge,
+        ),
         carrier_rf_hz=field.carrier_rf_hz,
         tone_hz=TONE_HZ,
         reflectors=[Reflector()],
         coefficient=[-0.3 + 0.1j],
         calibration_enu_m=calibration,
-        knowledge=field.knowledge,
     )
     stated = tilt_sigma_rad(solution.full_cov[:, :6, :6], field.rot_true[:, :, 2])
     np.testing.assert_allclose(stated, tilt_sigma_rad(cov[:, :6, :6], field.rot_true[:, :, 2]), rtol=0.02)

@@ -10,9 +10,8 @@ import pytest
 
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.exclusion import _problem
-from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
-from rfpose.multilat.rigid import Knowledge, solve_rigid
+from rfpose.multilat.integrity.hypotheses import Problem, judge, limit, noncentrality
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -52,13 +51,16 @@ class Field:
         }
 
     def guarded(self, z, **more):
-        return solve_with_integrity(TRANSMITTER, PLACES, z, **self.settings, **more)
+        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), **more)
 
     def plain(self, z):
-        return solve_rigid(TRANSMITTER, PLACES, z, **self.settings)
+        return solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings))
+
+    def problem(self, z):
+        return Problem.of(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings))
 
     def judged(self, z, poses):
-        return judge(_problem(TRANSMITTER, PLACES, z, SIGMA, self.common, [0], self.known), poses)
+        return judge(self.problem(z), poses)
 
     def error(self, normal):
         return np.linalg.norm(np.cross(normal, self.rot[:, :, 2]), axis=-1)
@@ -78,7 +80,7 @@ def test_without_errors_every_statistic_is_chi2_and_alarms_are_as_rare_as_stated
     for stat, dof in ((verdict.stat, verdict.dof), (verdict.link, verdict.link_dof)):
         mean, expected = stat.mean(axis=0), dof[0]
         assert np.all(np.abs(mean - expected) < 5.0 * np.sqrt(2.0 * expected / n) + 1e-9)
-    dof = _problem(TRANSMITTER, PLACES, field.z, SIGMA, field.common, [0], field.known).dof()
+    dof = field.problem(field.z).dof()
     assert poses.chi2.mean() == pytest.approx(dof[0], abs=5.0 * np.sqrt(2.0 * dof[0] / n))
     found = field.guarded(field.z, false_alarm=0.05)
     assert np.mean(found.status != IntegrityStatus.OK) < 0.05 + 5.0 * np.sqrt(0.05 / n)
@@ -178,7 +180,7 @@ def test_a_pivot_prior_that_contradicts_a_few_mirrors_costs_only_those():
     survey[:20, 1] += 1.0
     known = replace(field.known, pivot_enu_m=survey, pivot_sigma_m=5e-3)
     settings = {**field.settings, "knowledge": known}
-    found = solve_with_integrity(TRANSMITTER, PLACES, field.z, **settings)
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, field.z, **settings))
     assert found.prior_rejected[:20, 0].all()
     assert found.prior_rejected[20:].mean() < 0.02
     error = field.error(found.poses.normal_enu)

@@ -5,7 +5,7 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from sites import TABLE_2
 
@@ -37,17 +37,25 @@ def run(drift_ps_per_sqrt_min, *, jump_at=None, learn_with=None):
         z = z + SIGMA * rng.standard_normal(z.shape)
         common = {"sigma_m": np.full((N_MIRROR, 1, 3, 10), SIGMA), "transmitter_sigma_m": 1e-7, "clock_class": [0]}
         found = solve_rigid(
-            TRANSMITTER, PLACES, z[:, None], start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, **common
+            MirrorProblem.of(
+                TRANSMITTER, PLACES, z[:, None], start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, **common
+            )
         )
         records["pivot"].append(found.pivot_enu_m)
         records["rot"].append(found.rot_enu_from_mirror)
         records["clock"].append(found.clock_m)
         records["cov"].append(
-            full_covariance(TRANSMITTER, PLACES, found.pivot_enu_m, found.rot_enu_from_mirror, **common)
+            full_covariance(
+                MirrorProblem.expected(TRANSMITTER, PLACES, found.pivot_enu_m, found.rot_enu_from_mirror, **common)
+            )
         )
         records["true"].append(rot)
         for name, sigma in (("one", 0.0), ("three", np.inf)):
-            cov = rigid_bound(TRANSMITTER, PLACES, pivot, rot, knowledge=Knowledge(clock_sigma_m=sigma), **common)
+            cov = rigid_bound(
+                MirrorProblem.expected(
+                    TRANSMITTER, PLACES, pivot, rot, knowledge=Knowledge(clock_sigma_m=sigma), **common
+                )
+            )
             records[name].append(tilt_sigma_rad(cov, rot[:, :, 2]))
     out = {name: np.array(values) for name, values in records.items()}
     learned = learn_delays(

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, RigidStatus
-from rfpose.multilat.rigid.integers import IntegerMethod, Observation, solve_ladder
+from rfpose.multilat import PoseStatus
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid.integers import IntegerMethod, solve_ladder
 
 SPEED = 299_792_458.0
 TRANSMITTER = np.array(
@@ -57,15 +58,17 @@ def climb(rng, tone_rad, carrier_rad, rf, *, known, clock_spread=0.0, missing=Fa
         fine.range_m[::3, 1, :2] = np.nan
     start = rot @ rot_enu_from_mirror([0, 0, 1]).T @ rot_enu_from_mirror([0.07, 0.07, 1.0])
     found = solve_ladder(
-        TRANSMITTER,
-        np.tile(PLACES, (N, 1, 1)),
-        [coarse, fine],
-        start_pivot_enu_m=pivot,
-        start_rot_enu_from_mirror=start,
-        knowledge=known,
+        MirrorProblem.of_observations(
+            TRANSMITTER,
+            np.tile(PLACES, (N, 1, 1)),
+            [coarse, fine],
+            start_pivot_enu_m=pivot,
+            start_rot_enu_from_mirror=start,
+            knowledge=known,
+        ),
         **options,
     )
-    turns = np.rint((found.range_m[1] - whole) / fine.wavelength_m)
+    turns = np.rint((found.range_m[:, 1] - whole) / fine.wavelength_m)
     return found, turns, angle_between_rad(found.poses.normal_enu, rot[:, :, 2])
 
 
@@ -115,7 +118,7 @@ def test_integers_go_wrong_no_more_often_than_stated():
     careful, _, _ = climb(np.random.default_rng(4), 5e-4, 0.8, 100e6, known=Knowledge(clock_sigma_m=0.0))
     assert not careful.fixed[:, 1].any()
     assert np.all(careful.method[:, 1] == IntegerMethod.FLOAT)
-    assert np.mean(careful.poses.status == RigidStatus.OK) > 0.99  # float: the tone's pose stays
+    assert np.mean(careful.poses.status == PoseStatus.OK) > 0.99  # float: the tone's pose stays
 
 
 def test_unknown_delays_and_equal_carriers():

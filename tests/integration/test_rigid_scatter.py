@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, RigidStatus, rigid_bound, solve_rigid, tilt_sigma_rad
-from rfpose.multilat.rigid.integers import Observation, align_points, solve_ladder
+from rfpose.multilat import PoseStatus
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid.integers import align_points, solve_ladder
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -74,24 +75,28 @@ def test_scatter_is_the_bound(tones, rf, shared, pivot_sigma):
     # from 100 mrad and decimetres off
     start = rot @ rot_enu_from_mirror([0, 0, 1]).T @ rot_enu_from_mirror([0.07, 0.07, 1.0])
     found = solve_ladder(
-        TRANSMITTER,
-        places,
-        observations,
-        start_pivot_enu_m=pivot + 0.3 * rng.standard_normal((N, 3)),
-        start_rot_enu_from_mirror=start,
-        knowledge=knowledge,
+        MirrorProblem.of_observations(
+            TRANSMITTER,
+            places,
+            observations,
+            start_pivot_enu_m=pivot + 0.3 * rng.standard_normal((N, 3)),
+            start_rot_enu_from_mirror=start,
+            knowledge=knowledge,
+        )
     )
-    assert np.all(found.poses.status == RigidStatus.OK)
+    assert np.all(found.poses.status == PoseStatus.OK)
     assert np.all(found.fixed)
     cov = rigid_bound(
-        TRANSMITTER,
-        places,
-        pivot,
-        rot,
-        sigma_m=np.stack([o.sigma_m for o in observations], axis=1),
-        transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in observations], axis=1),
-        clock_class=np.arange(len(observations)),
-        knowledge=knowledge,
+        MirrorProblem.expected(
+            TRANSMITTER,
+            places,
+            pivot,
+            rot,
+            sigma_m=np.stack([o.sigma_m for o in observations], axis=1),
+            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in observations], axis=1),
+            clock_class=np.arange(len(observations)),
+            knowledge=knowledge,
+        )
     )
     bound = tilt_sigma_rad(cov, rot[:, :, 2])
     # every mirror has its own bound; errors in units of it, two angles a mirror: the rms is known to 0.9 to 1.3 %
@@ -107,10 +112,14 @@ def test_a_finer_tone_is_left_out_where_its_integers_are_not_safe():
     clock = rng.uniform(-100, 100, (N, 3, 1))
     coarse = observe(rng, distance, SPEED / 0.75e6, 0.1, 1e-6, clock, 0, wrapped=False)
     fine = observe(rng, distance, SPEED / 30e6, 1e-3, 1e-6, clock, 1, wrapped=True)
-    found = solve_ladder(TRANSMITTER, places, [coarse, fine], start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
+    found = solve_ladder(
+        MirrorProblem.of_observations(
+            TRANSMITTER, places, [coarse, fine], start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot
+        )
+    )
     assert not found.fixed[:, 1].any()
     assert np.all(found.wrong_risk[:, 1] > 1e-6)
-    assert np.any(found.poses.status == RigidStatus.OK)  # the coarse tone alone still gives what it can
+    assert np.any(found.poses.status == PoseStatus.OK)  # the coarse tone alone still gives what it can
 
 
 def test_tones_075_and_61_beat_the_coarse_one_alone():
@@ -120,13 +129,15 @@ def test_tones_075_and_61_beat_the_coarse_one_alone():
     for tones in ((0.75e6,), (0.75e6, 6.1e6)):
         sigma = [np.full((N, 3, 10), SPEED / f / (2 * np.pi) * 1.58e-5) for f in tones]
         cov = rigid_bound(
-            TRANSMITTER,
-            places,
-            pivot,
-            rot,
-            sigma_m=np.stack(sigma, axis=1),
-            transmitter_sigma_m=1e-9,
-            clock_class=np.arange(len(tones)),
+            MirrorProblem.expected(
+                TRANSMITTER,
+                places,
+                pivot,
+                rot,
+                sigma_m=np.stack(sigma, axis=1),
+                transmitter_sigma_m=1e-9,
+                clock_class=np.arange(len(tones)),
+            )
         )
         bounds.append(np.sqrt(np.mean(tilt_sigma_rad(cov, rot[:, :, 2]) ** 2)))
     assert bounds[1] / bounds[0] < 0.125
@@ -143,13 +154,15 @@ def test_alignment_finds_the_rotation():
     np.testing.assert_allclose(origin[good], pivot[good], atol=1e-9)
     assert np.isnan(found[7]).all()
     status = solve_rigid(
-        TRANSMITTER,
-        places[:8],
-        np.zeros((8, 1, 3, 10)),
-        sigma_m=1.0,
-        transmitter_sigma_m=1e-9,
-        clock_class=[0],
-        start_pivot_enu_m=origin[:8],
-        start_rot_enu_from_mirror=found[:8],
+        MirrorProblem.of(
+            TRANSMITTER,
+            places[:8],
+            np.zeros((8, 1, 3, 10)),
+            sigma_m=1.0,
+            transmitter_sigma_m=1e-9,
+            clock_class=[0],
+            start_pivot_enu_m=origin[:8],
+            start_rot_enu_from_mirror=found[:8],
+        )
     ).status
-    assert status[7] == RigidStatus.NO_START
+    assert status[7] == PoseStatus.TOO_FEW

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from rfpose.multilat.ground import Reflector, Surface, _kernels, _problem, model
-from rfpose.multilat.rigid import Knowledge
-from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation
 
 SPEED = 299_792_458.0
 TRANSMITTER = np.array([[100.0, 0, 20], [50, 86.6, 30], [-50, 86.6, 20], [-100, 0, 30], [0, -50, 40.0], [0, 0, 50]])
@@ -40,6 +39,7 @@ def make_problem(planes, *, calibration=None, n_mirror=2):
             transmitter_sigma_m=np.full((n_mirror, len(TRANSMITTER)), np.inf),
             wavelength_m=np.full(len(TRANSMITTER), 40.0),
             clock_class=k,
+            carrier=k == 1,
         )
         for sigma, k in ((5e-3, 0), (5e-4, 0), (2e-4, 1))
     ]
@@ -48,15 +48,11 @@ def make_problem(planes, *, calibration=None, n_mirror=2):
     rot = np.array([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(n_mirror)])
     rot *= np.linalg.det(rot)[:, None, None]
     known = Knowledge(clock_sigma_m=np.inf, pivot_enu_m=pivot, pivot_sigma_m=5e-3)
+    mirrors = MirrorProblem.of_observations(
+        TRANSMITTER, PLACES, observations, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, knowledge=known
+    )
     problem, clock = _problem.build(
-        scene,
-        np.broadcast_to(PLACES, (n_mirror, 3, 3)),
-        observations,
-        [o.range_m for o in observations],
-        pivot,
-        rot,
-        calibration=np.empty((0, 3)) if calibration is None else calibration,
-        known=known,
+        scene, mirrors, calibration=np.empty((0, 3)) if calibration is None else calibration
     )
     state = _problem.State.begin(pivot, rot, clock, np.zeros(n_mirror, np.int64), problem.n_parameter)
     return problem, state

@@ -9,7 +9,7 @@ from rfpose.layout.gain import Reflection, gain_of, normal_gain
 from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.layout.sensitivity import transmitter_sensitivity
 from rfpose.measurement import Estimator, Noise
-from rfpose.multilat.rigid import Knowledge, solve_rigid
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
     [
@@ -66,15 +66,17 @@ def test_squares_of_the_gain_are_the_map(mirrors, estimator, calibration, range_
 def solved(mirrors, transmitter, ranges, estimator):
     """Normals that the solver finds when it believes in the places of ``transmitter``."""
     return solve_rigid(
-        transmitter,
-        mirrors.receiver_mirror_m,
-        ranges,
-        sigma_m=noise(0.0).tone_sigma_m[:1, None],
-        transmitter_sigma_m=0.0,
-        clock_class=[0],
-        start_pivot_enu_m=mirrors.pivot_enu_m,
-        start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
-        knowledge=Knowledge(clock_sigma_m=estimator.clock_sigma_m),
+        MirrorProblem.of(
+            transmitter,
+            mirrors.receiver_mirror_m,
+            ranges,
+            sigma_m=noise(0.0).tone_sigma_m[:1, None],
+            transmitter_sigma_m=0.0,
+            clock_class=[0],
+            start_pivot_enu_m=mirrors.pivot_enu_m,
+            start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
+            knowledge=Knowledge(clock_sigma_m=estimator.clock_sigma_m),
+        )
     ).normal_enu
 
 

@@ -9,7 +9,7 @@ from rfpose.layout.optimise import CRITERIA
 from rfpose.layout.optimise.search import _rows
 from rfpose.measurement import Estimator, Noise
 from rfpose.multilat import dop, normal_bound, position_bound
-from rfpose.multilat.rigid import Knowledge, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -81,14 +81,16 @@ def test_rigid_bound(mirrors, estimator, known, n_tone, calibration):
         sigma = np.concatenate([sigma, np.full((1, 3, 10), 1e-4)])
         common = np.concatenate([common, np.full((1, 10), np.inf)])
     cov = rigid_bound(
-        TRANSMITTER,
-        mirrors.receiver_mirror_m,
-        mirrors.pivot_enu_m,
-        mirrors.rot_enu_from_mirror,
-        sigma_m=np.repeat(sigma[None], N, axis=0),
-        transmitter_sigma_m=common,
-        clock_class=np.arange(len(sigma)),
-        knowledge=Knowledge(pivot_enu_m=mirrors.pivot_enu_m, **known),
+        MirrorProblem.expected(
+            TRANSMITTER,
+            mirrors.receiver_mirror_m,
+            mirrors.pivot_enu_m,
+            mirrors.rot_enu_from_mirror,
+            sigma_m=np.repeat(sigma[None], N, axis=0),
+            transmitter_sigma_m=common,
+            clock_class=np.arange(len(sigma)),
+            knowledge=Knowledge(pivot_enu_m=mirrors.pivot_enu_m, **known),
+        )
     )
     got = normal_map(TRANSMITTER, mirrors, plan, estimator)
     # the solver ties a shared clock's receivers with a large finite weight

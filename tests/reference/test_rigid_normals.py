@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.scenario import load_scenario
 
 SITE = load_scenario(Path(__file__).resolve().parents[2] / "data" / "table2.toml")
@@ -33,7 +33,7 @@ def test_table_of_fact_4(place, facing, three_clocks, one_clock, shared):
     common = {"transmitter_sigma_m": 1e-12, "clock_class": [0], "knowledge": knowledge}
     sigma = np.full((1, 1, 3, 10), SIGMA)
     place = np.array([place], float)
-    cov = rigid_bound(SITE.transmitter_enu_m, PLACES, place, rot[None], sigma_m=sigma, **common)
+    cov = rigid_bound(MirrorProblem.expected(SITE.transmitter_enu_m, PLACES, place, rot[None], sigma_m=sigma, **common))
     bound = tilt_sigma_rad(cov, rot[None, :, 2])[0]
     assert 1e3 * bound == pytest.approx(one_clock if shared else three_clocks, abs=0.006)
     # 4000 runs of two angles each: the rms is known to 0.8 %
@@ -43,13 +43,15 @@ def test_table_of_fact_4(place, facing, three_clocks, one_clock, shared):
     z = distance + 0.2 + SIGMA * rng.standard_normal((n_run, 1, 3, 10))
     start = rot_enu_from_mirror(np.asarray(facing) + 0.05 * rng.standard_normal((n_run, 3)))
     found = solve_rigid(
-        SITE.transmitter_enu_m,
-        PLACES,
-        z,
-        sigma_m=SIGMA,
-        start_pivot_enu_m=place + 0.01 * rng.standard_normal((n_run, 3)),
-        start_rot_enu_from_mirror=start,
-        **common,
+        MirrorProblem.of(
+            SITE.transmitter_enu_m,
+            PLACES,
+            z,
+            sigma_m=SIGMA,
+            start_pivot_enu_m=place + 0.01 * rng.standard_normal((n_run, 3)),
+            start_rot_enu_from_mirror=start,
+            **common,
+        )
     )
     assert np.all(found.status == 0)
     error = np.sqrt(np.mean(angle_between_rad(found.normal_enu, rot[:, 2]) ** 2))

@@ -44,7 +44,12 @@ class Wavelengths:
     @property
     def n_tone(self) -> int:
         """Groups that are tones."""
-        return int(np.count_nonzero(self.tone != CARRIER))
+        return int(np.count_nonzero(~self.is_carrier))
+
+    @property
+    def is_carrier(self) -> npt.NDArray[np.bool_]:
+        """(group,) whether it is the carrier's own phase."""
+        return np.asarray(self.tone == CARRIER)
 
     @property
     def clock_class(self) -> npt.NDArray[np.int64]:

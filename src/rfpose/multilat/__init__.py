@@ -2,8 +2,9 @@
 
 from rfpose.multilat.bounds import dop, normal_bound, position_bound, tilt_rms_from_position
 from rfpose.multilat.fix import Fixes, FixStatus, locate
-from rfpose.multilat.normal import Normals, Poses, PoseStatus, joint_covariance, mirror_normal, solve_poses
+from rfpose.multilat.normal import Normals, Poses, joint_covariance, mirror_normal, solve_poses
 from rfpose.multilat.ranges import RangeDifferences, RangeStatus, check_unambiguous, range_differences
+from rfpose.multilat.status import PoseStatus
 from rfpose.multilat.tracking import Motion, TrackedPoses, TrackStatus, track_poses
 
 __all__ = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -14,53 +13,14 @@ from rfpose.errors import InvalidInputError
 from rfpose.geometry import azimuth_elevation_from_enu, is_collinear
 from rfpose.multilat import _kernels
 from rfpose.multilat.fix import Fixes, FixStatus, Side, check_transmitters, locate
+from rfpose.multilat.status import PoseStatus
 
-__all__ = ["Normals", "PoseStatus", "Poses", "joint_covariance", "mirror_normal", "solve_poses"]
+__all__ = ["Normals", "Poses", "joint_covariance", "mirror_normal", "solve_poses"]
 
 # Receivers whose spread across their line is below this part of the spread along it fix no normal.
 COLLINEAR = 1e-3
 # A normal whose RMS angle exceeds this is not solved: so far off, a straight line's covariance says little of it [rad].
 MAX_SIGMA_RAD = 0.1
-
-
-class PoseStatus(IntEnum):
-    """What became of one mirror's normal; ``reason`` says it in words."""
-
-    OK = 0
-    TOO_FEW = 1
-    COLLINEAR = 2
-    RESIDUAL = 3
-    UNDETERMINED = 4
-    NOT_CONVERGED = 5
-    UNEXPLAINED = 6
-    BEHIND_REFLECTOR = 7
-    UNKNOWNS = 8
-    UNCERTAIN = 9
-    AMBIGUOUS = 10
-
-    @property
-    def reason(self) -> str:
-        """The status in words."""
-        return _REASON[self]
-
-
-_REASON = {
-    PoseStatus.OK: "solved",
-    PoseStatus.TOO_FEW: "fewer than three receivers of the mirror were located",
-    PoseStatus.COLLINEAR: "the located receivers lie on one line",
-    PoseStatus.RESIDUAL: "solved, but a receiver's residuals are far above what the sigma of the ranges allows",
-    PoseStatus.UNDETERMINED: "the measurements leave part of the pose open; more transmitters or a surveyed pivot help",
-    PoseStatus.NOT_CONVERGED: "the pose did not converge",
-    PoseStatus.UNEXPLAINED: "solved, but residuals are larger than noise and a few bad transmitters explain: "
-    "a reflection that is not in the model?",
-    PoseStatus.BEHIND_REFLECTOR: "a receiver lies behind a reflecting plane (below the ground)",
-    PoseStatus.UNCERTAIN: "the normal is known to no better than 0.1 rad; a better signal, receivers farther apart or "
-    "known delays would help",
-    PoseStatus.AMBIGUOUS: "two poses fit alike, mirrored in the transmitters' plane; transmitters of unequal heights "
-    "or a surveyed pivot would tell",
-    PoseStatus.UNKNOWNS: "fewer measurements than unknowns: more transmitters received, a surveyed pivot, a mount or "
-    "known delays would help",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

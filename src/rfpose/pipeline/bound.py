@@ -13,7 +13,7 @@ from rfpose.geometry import rot_enu_from_mirror
 from rfpose.measurement import reflectors_of
 from rfpose.multilat import normal_bound
 from rfpose.multilat.ground import ground_bound
-from rfpose.multilat.rigid import full_covariance, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorProblem, full_covariance, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, is_calibrated, mirror_groups
@@ -100,21 +100,18 @@ def _rigid(
     n_frame = len(noise.tone_rad)
     calibration = noise.calibration_rad if is_calibrated(scenario) else None
     sigma, common = group.range_noise(noise.tone_rad, noise.carrier_rad, calibration)
-    places = np.tile(group.places_m, (n_frame, 1, 1))
-    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
-    known = group.knowledge(n_frame)
-    classes = group.waves.clock_class
+    mirrors = MirrorProblem.expected(
+        scenario.transmitter_enu_m,
+        np.tile(group.places_m, (n_frame, 1, 1)),
+        np.tile(group.pivot_enu_m, (n_frame, 1)),
+        rot,
+        sigma_m=sigma,
+        transmitter_sigma_m=common,
+        clock_class=group.waves.clock_class,
+        knowledge=group.knowledge(n_frame),
+    )
     if choice.reflection == "none":
-        return full_covariance(
-            scenario.transmitter_enu_m,
-            places,
-            pivot,
-            rot,
-            sigma_m=sigma,
-            transmitter_sigma_m=common,
-            clock_class=classes,
-            knowledge=known,
-        )
+        return full_covariance(mirrors)
     reflectors = reflectors_of(scenario, choice.reflection)
     truth = np.zeros(len(reflectors), np.complex128) if coefficient is None else np.asarray(coefficient)
     n_helio = len(group.column)
@@ -124,19 +121,12 @@ def _rigid(
     out = np.full((len(rot), *2 * (6 + sigma.shape[1] * sigma.shape[2],)), np.nan)
     for rows in shared:
         out[rows] = ground_bound(
-            scenario.transmitter_enu_m,
-            places[rows],
-            pivot[rows],
-            rot[rows],
-            sigma_m=sigma[rows],
-            transmitter_sigma_m=common[rows],
-            clock_class=classes,
+            mirrors.take(rows),
             carrier_rf_hz=scenario.carrier_rf_hz,
             tone_hz=group.waves.tone_hz,
             reflectors=reflectors,
             coefficient=[complex(c) for c in truth],
             calibration_enu_m=calibration_sight(average, scenario, rows // n_helio),
-            knowledge=known,
             free_space=scenario.reflection.spreading == "free_space",
             propagation_speed_mps=scenario.radio.propagation_speed_mps,
         )

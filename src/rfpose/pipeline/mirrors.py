@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,9 +16,10 @@ from rfpose.measurement import Estimator, Wavelengths, estimator_of, wavelengths
 from rfpose.measurement.wavelengths import CARRIER
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.ground import CalibrationSight
-from rfpose.multilat.rigid import Knowledge
-from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid import Knowledge, Observation
 from rfpose.scenario import Scenario
+
+_Number = TypeVar("_Number", bound=np.generic)
 
 __all__ = ["MirrorGroup", "calibration_sight", "is_calibrated", "mirror_groups", "observations"]
 
@@ -57,7 +59,7 @@ class MirrorGroup:
         """Return what is known of these mirrors, one row a frame and heliostat."""
         return self.estimator.knowledge(np.tile(self.pivot_enu_m, (n_frame, 1)))
 
-    def of_mirrors(self, values: npt.NDArray[np.float64]) -> FloatArray:
+    def of_mirrors(self, values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
         """Take values (frame, receiver axis, …) apart: (frame × heliostat, receiver, …)."""
         picked = values[:, self.rows]
         return picked.reshape(-1, *picked.shape[2:])
@@ -145,6 +147,7 @@ def observations(
                 transmitter_sigma_m=common[:, k],
                 wavelength_m=np.array(wavelength),
                 clock_class=int(group.waves.clock_class[k]),
+                carrier=q == CARRIER,
             )
         )
     return out

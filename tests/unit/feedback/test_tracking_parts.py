@@ -26,7 +26,7 @@ from rfpose.feedback.tracking.wind import Gusts
 from rfpose.feedback.wind.spectrum import wind_deflection
 from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.measurement import Estimator, noise_of
-from rfpose.multilat.rigid import Knowledge, rigid_bound
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -227,13 +227,13 @@ def test_radio_noise_lies_as_the_pose_has_it():
     spread = radio_model(scenario, normal).errors(normal, np.random.default_rng(0)).spread_rad
     noise = noise_of(scenario)
     sigma = np.concatenate([noise.tone_sigma_m, noise.carrier_sigma_m[None]])[:, None, :]
-    cov = rigid_bound(
+    common = np.concatenate([noise.calibration_sigma_m, np.full((1, 10), np.inf)])
+    mirrors = MirrorProblem.expected(
         scenario.transmitter_enu_m, places, scenario.pivot_enu_m, rot,
-        sigma_m=np.broadcast_to(sigma, (12, 3, 3, 10)),
-        transmitter_sigma_m=np.concatenate([noise.calibration_sigma_m, np.full((1, 10), np.inf)]),
-        clock_class=[0, 1, 2],
+        sigma_m=np.broadcast_to(sigma, (12, 3, 3, 10)), transmitter_sigma_m=common, clock_class=[0, 1, 2],
         knowledge=Knowledge(clock_sigma_m=0.0, pivot_enu_m=scenario.pivot_enu_m, pivot_sigma_m=5e-3),
-    )[:, 3:, 3:]  # fmt: skip
+    )  # fmt: skip
+    cov = rigid_bound(mirrors)[:, 3:, 3:]
     for m in range(12):
         cross = np.cross(np.eye(3), normal[m])  # rows: e_i × n
         of_normal = cross.T @ cov[m] @ cross

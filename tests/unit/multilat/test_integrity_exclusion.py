@@ -7,10 +7,10 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror
+from rfpose.multilat import PoseStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.exclusion import _problem
-from rfpose.multilat.integrity.hypotheses import judge, log_probability, noncentrality
-from rfpose.multilat.rigid import Knowledge, RigidStatus, solve_rigid
+from rfpose.multilat.integrity.hypotheses import Problem, judge, log_probability, noncentrality
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -62,14 +62,15 @@ def test_a_statistic_is_the_drop_of_chi2_when_its_part_is_freed(name):
     known, calibration = KNOWN[name]
     z = measure(1, n_group=2, calibration=calibration, scale=0.01)
     keys = settings(known, calibration, n_group=2)
-    poses = solve_rigid(TRANSMITTER, PLACES, z, **keys)
-    problem = _problem(TRANSMITTER, PLACES, z, SIGMA, calibration, [0, 0], known)
+    mirrors = MirrorProblem.of(TRANSMITTER, PLACES, z, **keys)
+    poses = solve_rigid(mirrors)
+    problem = Problem.of(mirrors)
     verdict = judge(problem, poses)
     assert verdict.ok.all()
 
     def drop(ranges, without):
-        again = solve_rigid(TRANSMITTER, PLACES, ranges, **{**keys, "knowledge": without})
-        assert np.all(again.status == RigidStatus.OK)
+        again = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, ranges, **{**keys, "knowledge": without}))
+        assert np.all(again.status == PoseStatus.OK)
         tilt = np.einsum("mac,mab,mbd->mcd", ROT[:, :, :2], (again.cov - poses.cov)[:, 3:, 3:], ROT[:, :, :2])
         return poses.chi2 - again.chi2, tilt
 
@@ -97,7 +98,9 @@ def test_a_statistic_is_the_drop_of_chi2_when_its_part_is_freed(name):
 
 def test_every_prior_is_tested_where_it_can_be():
     known, calibration = KNOWN["everything"]
-    found = solve_with_integrity(TRANSMITTER, PLACES, measure(2, delays=2e-3), **settings(known, calibration))
+    found = solve_with_integrity(
+        MirrorProblem.of(TRANSMITTER, PLACES, measure(2, delays=2e-3), **settings(known, calibration))
+    )
     assert found.prior_testable.all()
     assert np.all(found.status == IntegrityStatus.OK)
 
@@ -118,7 +121,9 @@ def test_what_was_chosen_for_fitting_is_less_certain_than_it_looks():
         z += size * SIGMA * bad[:, None, None, :] * rng.standard_normal(z.shape)
         rot = np.tile(ROT, (200, 1, 1))
         start = {"start_pivot_enu_m": np.tile(PIVOT + 0.2, (200, 1)), "start_rot_enu_from_mirror": rot}
-        found = solve_with_integrity(TRANSMITTER, PLACES, z, **{**settings(), **start}, false_alarm=1e-3)
+        found = solve_with_integrity(
+            MirrorProblem.of(TRANSMITTER, PLACES, z, **{**settings(), **start}), false_alarm=1e-3
+        )
         left_out = (found.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1) & found.ok
         assert left_out.sum() > 50
         sigma = found.poses.tilt_sigma_rad[left_out]
@@ -136,11 +141,11 @@ def test_what_was_chosen_for_fitting_is_less_certain_than_it_looks():
 def test_an_error_is_found_named_and_left_out(pattern, size_sigma):
     shape, cause = PATTERNS[pattern]
     z = measure(3)
-    clean = solve_with_integrity(TRANSMITTER, PLACES, z, **settings())
+    clean = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     assert np.all(clean.status == IntegrityStatus.OK)
     assert np.all(clean.transmitter_status == TransmitterStatus.OK)
     z[:, 0, :, 4] += size_sigma * SIGMA * np.array(shape)
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings())
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     assert np.all(found.status == IntegrityStatus.EXCLUDED)
     assert np.all(found.transmitter_status[:, 4] == cause)
     assert np.all(np.delete(found.transmitter_status, 4, axis=1) == TransmitterStatus.OK)
@@ -151,7 +156,9 @@ def test_an_error_is_found_named_and_left_out(pattern, size_sigma):
     without = z.copy()
     without[:, 0][~found.used] = np.nan
     np.testing.assert_allclose(
-        found.poses.normal_enu, solve_rigid(TRANSMITTER, PLACES, without, **settings()).normal_enu, atol=1e-6
+        found.poses.normal_enu,
+        solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, without, **settings())).normal_enu,
+        atol=1e-6,
     )
 
 
@@ -159,7 +166,7 @@ def test_noise_far_above_the_others_is_called_interference():
     z, sigma = measure(4), np.full((4, 1, 3, 10), SIGMA)
     sigma[..., 2] *= 5.0
     z[..., 2] += np.array([200.0, -150.0, 90.0]) * SIGMA
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **{**settings(), "sigma_m": sigma})
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **{**settings(), "sigma_m": sigma}))
     assert np.all(found.transmitter_status[:, 2] == TransmitterStatus.INTERFERENCE)
 
 
@@ -167,7 +174,7 @@ def test_two_errors_are_both_left_out_and_nothing_else():
     z = measure(5)
     z[..., 1] += 60.0 * SIGMA
     z[:, :, 2, 7] -= 45.0 * SIGMA
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings())
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     out = found.transmitter_status > TransmitterStatus.NOT_RECEIVED
     np.testing.assert_array_equal(np.flatnonzero(out.all(axis=0)), [1, 7])
     assert out.sum() == 2 * len(z)
@@ -177,9 +184,9 @@ def test_two_errors_are_both_left_out_and_nothing_else():
 def test_a_transmitters_own_error_is_harmless_between_receivers():
     known, _ = KNOWN["between receivers"]
     z = measure(6, calibration=np.inf)
-    before = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(known, np.inf))
+    before = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known, np.inf)))
     z[..., 3] += 0.8
-    after = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(known, np.inf))
+    after = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known, np.inf)))
     np.testing.assert_array_equal(after.status, before.status)
     np.testing.assert_allclose(after.poses.normal_enu, before.poses.normal_enu, atol=1e-7)
     np.testing.assert_allclose(after.protection_level_rad, before.protection_level_rad, rtol=1e-6)
@@ -191,12 +198,12 @@ def test_a_pivot_that_is_off_is_rejected_not_averaged(off_m):
     survey[1, 0] += off_m
     known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=survey, pivot_sigma_m=5e-3)
     z = measure(7)
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(known))
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known)))
     assert found.status[1] == IntegrityStatus.PRIOR_REJECTED
     np.testing.assert_array_equal(found.prior_rejected, [[False] * 3, [True, False, False], [False] * 3, [False] * 3])
     assert "pivot" in found.reasons()[1]
     assert np.all(found.transmitter_status == TransmitterStatus.OK)
-    without = solve_rigid(TRANSMITTER, PLACES, z, **settings())
+    without = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     np.testing.assert_allclose(found.poses.normal_enu[1], without.normal_enu[1], atol=1e-7)
     np.testing.assert_allclose(found.poses.pivot_enu_m[1], PIVOT[1], atol=0.05)
 
@@ -213,7 +220,7 @@ def test_a_wrong_mount_or_clock_is_rejected(prior):
         z[2, 0] += np.linalg.norm(receiver[:, None] - TRANSMITTER, axis=-1)
         z[2, 0] -= np.linalg.norm((PIVOT[2] + PLACES @ ROT[2].T)[:, None] - TRANSMITTER, axis=-1)
         known = Knowledge(clock_sigma_m=0.0, two_axis=True)
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(known))
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known)))
     which = ("pivot", "mount", "clocks").index(prior)
     np.testing.assert_array_equal(np.argwhere(found.prior_rejected), [[2, which]])
     assert found.status[2] == IntegrityStatus.PRIOR_REJECTED
@@ -225,8 +232,8 @@ def test_without_redundancy_it_says_so():
     known, _ = KNOWN["between receivers"]
     known = replace(known, clock_sigma_m=np.inf)
     z = measure(9, calibration=np.inf)[..., [0, 2, 5]]
-    found = solve_with_integrity(TRANSMITTER[[0, 2, 5]], PLACES, z, **settings(known, np.inf))
-    assert np.all(found.poses.status == RigidStatus.OK)
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER[[0, 2, 5]], PLACES, z, **settings(known, np.inf)))
+    assert np.all(found.poses.status == PoseStatus.OK)
     assert np.all(np.isinf(found.protection_level_rad))
     assert np.all(found.status == IntegrityStatus.NO_REDUNDANCY)
     assert not found.ok.any()
@@ -235,7 +242,7 @@ def test_without_redundancy_it_says_so():
 def test_too_many_errors_are_not_explained_away():
     z = measure(10)
     z[0, 0] += 0.1 * np.random.default_rng(0).standard_normal((3, 10))
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings())
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     assert found.status[0] == IntegrityStatus.UNEXPLAINED
     assert np.isinf(found.protection_level_rad[0])
     assert np.all(found.status[1:] == IntegrityStatus.OK)
@@ -244,20 +251,22 @@ def test_too_many_errors_are_not_explained_away():
 def test_only_testing_leaves_the_pose_alone():
     z = measure(11)
     z[..., 4] += 0.05
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **settings(), max_excluded=0)
-    np.testing.assert_array_equal(found.poses.normal_enu, solve_rigid(TRANSMITTER, PLACES, z, **settings()).normal_enu)
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()), max_excluded=0)
+    np.testing.assert_array_equal(
+        found.poses.normal_enu, solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings())).normal_enu
+    )
     assert np.all(found.status == IntegrityStatus.UNEXPLAINED)
 
 
 def test_bad_rows_leave_the_others_alone():
     z = measure(12)
-    good = solve_with_integrity(TRANSMITTER, PLACES, z, **settings())
+    good = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings()))
     z[0] = np.nan
     z[2, :, :, 3] = np.nan
     keys = settings()
     keys["start_pivot_enu_m"] = keys["start_pivot_enu_m"].copy()
     keys["start_pivot_enu_m"][1] = np.nan
-    found = solve_with_integrity(TRANSMITTER, PLACES, z, **keys)
+    found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **keys))
     np.testing.assert_array_equal(found.status, [6, 6, 0, 0])
     assert np.isnan(found.poses.normal_enu[:2]).all()
     assert np.isinf(found.protection_level_rad[:2]).all()
@@ -268,7 +277,7 @@ def test_bad_rows_leave_the_others_alone():
 @pytest.mark.parametrize("wrong", [{"false_alarm": 0.0}, {"missed_detection": 1.0}, {"max_excluded": -1}])
 def test_settings_are_checked(wrong):
     with pytest.raises(InvalidInputError, match=next(iter(wrong))):
-        solve_with_integrity(TRANSMITTER, PLACES, measure(13), **settings(), **wrong)
+        solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, measure(13), **settings()), **wrong)
 
 
 def test_log_probability_far_out():
@@ -286,3 +295,15 @@ def test_noncentrality_is_missed_as_often_as_stated():
     x[:, 0] += np.sqrt(found)
     missed = np.mean(np.sum(x**2, axis=1) < 20.0)
     assert missed == pytest.approx(0.05, abs=5 * np.sqrt(0.05 * 0.95 / 200_000))
+
+
+def test_a_receiver_that_hears_nothing_brings_no_clock():
+    """What is counted against chi² in the test of all residuals is what the solver itself counts."""
+    z = measure(14, n_group=2)
+    z[:, :, 2] = np.nan
+    mirrors = MirrorProblem.of(
+        TRANSMITTER, PLACES, z, **settings(Knowledge(pivot_enu_m=PIVOT, pivot_sigma_m=5e-3), n_group=2)
+    )
+    np.testing.assert_array_equal(Problem.of(mirrors).dof(), solve_rigid(mirrors).dof)
+    # two receivers' ranges by ten transmitters in two wavelengths and a pivot, less pose and two clocks
+    np.testing.assert_array_equal(Problem.of(mirrors).dof(), 2 * z.shape[3] * 2 + 3 - 6 - 2)

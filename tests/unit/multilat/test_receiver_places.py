@@ -5,7 +5,7 @@ import pytest
 
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge
+from rfpose.multilat.rigid import Knowledge, MirrorProblem
 from rfpose.multilat.rigid.places import places_bound, refine_places
 
 RNG = np.random.default_rng(9)
@@ -28,18 +28,21 @@ def measure(rng, places, *, calibration=1e-4, clocks=4, rot=None):
     return z + SIGMA * rng.standard_normal(z.shape), rot
 
 
-def refine(z, rot, *, calibration=1e-4, **settings):
+def refine(z, rot, *, calibration=1e-4, knowledge=None, common_pivot=True):
     turned = rot @ rot_enu_from_mirror([0, 0, 1]).T @ rot_enu_from_mirror([0.002, 0.001, 1.0])
     return refine_places(
-        TRANSMITTER,
-        DRAWN,
-        z,
-        sigma_m=SIGMA,
-        transmitter_sigma_m=calibration,
-        clock_class=[0],
-        pivot_enu_m=np.tile(PIVOT + 1e-3, (len(rot), 1)),
-        rot_enu_from_mirror=turned,
-        **settings,
+        MirrorProblem.of(
+            TRANSMITTER,
+            DRAWN,
+            z,
+            sigma_m=SIGMA,
+            transmitter_sigma_m=calibration,
+            clock_class=[0],
+            start_pivot_enu_m=np.tile(PIVOT + 1e-3, (len(rot), 1)),
+            start_rot_enu_from_mirror=turned,
+            knowledge=knowledge,
+        ),
+        common_pivot=common_pivot,
     )
 
 
@@ -109,14 +112,16 @@ def test_what_nothing_shows_is_named():
 
 def bound(rot, **settings):
     return places_bound(
-        TRANSMITTER,
-        DRAWN,
-        np.tile(PIVOT, (len(rot), 1)),
-        rot,
-        sigma_m=np.full((len(rot), 1, 4, 9), SIGMA),
-        transmitter_sigma_m=1e-4,
-        clock_class=[0],
-        **settings,
+        MirrorProblem.expected(
+            TRANSMITTER,
+            DRAWN,
+            np.tile(PIVOT, (len(rot), 1)),
+            rot,
+            sigma_m=np.full((len(rot), 1, 4, 9), SIGMA),
+            transmitter_sigma_m=1e-4,
+            clock_class=[0],
+            **settings,
+        )
     )
 
 
@@ -143,12 +148,14 @@ def test_bad_arguments():
         refine(z[:0], rot[:0])
     with pytest.raises(GeometryError, match="line"):
         refine_places(
-            TRANSMITTER,
-            DRAWN * [1, 0, 0],
-            z,
-            sigma_m=SIGMA,
-            transmitter_sigma_m=1.0,
-            clock_class=[0],
-            pivot_enu_m=np.tile(PIVOT, (len(rot), 1)),
-            rot_enu_from_mirror=rot,
+            MirrorProblem.of(
+                TRANSMITTER,
+                DRAWN * [1, 0, 0],
+                z,
+                sigma_m=SIGMA,
+                transmitter_sigma_m=1.0,
+                clock_class=[0],
+                start_pivot_enu_m=np.tile(PIVOT, (len(rot), 1)),
+                start_rot_enu_from_mirror=rot,
+            )
         )

@@ -20,8 +20,7 @@ from rfpose.measurement import estimator_of, noise_of, simulated_ground, wavelen
 from rfpose.multilat.fix import check_transmitters
 from rfpose.multilat.ground import solve_with_ground
 from rfpose.multilat.ground.model import range_shift_m
-from rfpose.multilat.rigid import rigid_bound
-from rfpose.multilat.rigid.integers import Observation
+from rfpose.multilat.rigid import MirrorProblem, Observation, rigid_bound
 from rfpose.scenario import Scenario
 
 __all__ = ["RadioErrors", "RadioModel"]
@@ -134,23 +133,23 @@ class RadioModel:
         pivot = self._pivot
         sigma = np.where(hidden, np.inf, self._sigma_m(pivot, rot))
         n_tone = self._waves.n_tone
-        known = self._estimator.knowledge(pivot)
-        common, classes = self._common_m, self._waves.clock_class
-        bound = rigid_bound(
-            self._scenario.transmitter_enu_m, self._places, pivot, rot, sigma_m=sigma[:, :n_tone],
-            transmitter_sigma_m=common[:n_tone], clock_class=classes[:n_tone], knowledge=known,
-        )  # fmt: skip
-        turn = bound[:, 3:, 3:]
+        mirrors = MirrorProblem.expected(
+            self._scenario.transmitter_enu_m,
+            self._places,
+            pivot,
+            rot,
+            sigma_m=sigma,
+            transmitter_sigma_m=self._common_m,
+            clock_class=self._waves.clock_class,
+            knowledge=self._estimator.knowledge(pivot),
+        )
+        turn = rigid_bound(mirrors.groups(slice(n_tone)))[:, 3:, 3:]
         if sigma.shape[1] == n_tone:
             return turn
         wavelength = self._waves.wavelength_m[-1]
         extent = float(np.linalg.norm(self._places - self._places[0], axis=1).max())
         finds = extent * np.sqrt(np.trace(turn, axis1=1, axis2=2)) < _SAFE_WAVELENGTHS * float(wavelength.min())
-        finer = rigid_bound(
-            self._scenario.transmitter_enu_m, self._places, pivot, rot, sigma_m=sigma,
-            transmitter_sigma_m=common, clock_class=classes, knowledge=known,
-        )[:, 3:, 3:]  # fmt: skip
-        return np.where(finds[:, None, None], finer, turn)
+        return np.where(finds[:, None, None], rigid_bound(mirrors)[:, 3:, 3:], turn)
 
     # -- what goes into a pose -----------------------------------------------------------------------------
 
@@ -205,6 +204,7 @@ class RadioModel:
                 transmitter_sigma_m=np.broadcast_to(common[g], (len(pivot), common.shape[1])).copy(),
                 wavelength_m=waves.wavelength_m[g],
                 clock_class=int(waves.clock_class[g]),
+                carrier=bool(waves.is_carrier[g]),
             )
             for g in range(len(waves.tone))
         ]
@@ -213,17 +213,19 @@ class RadioModel:
         """Return normals and rotation covariances of the sampled mirrors by the solver itself."""
         sample = self._nearest[0]
         pivot, rot = self._pivot[sample], rot[sample]
-        found = solve_with_ground(
+        mirrors = MirrorProblem.of_observations(
             self._scenario.transmitter_enu_m,
             self._places,
             self._observations(pivot, rot),
-            carrier_rf_hz=self._scenario.carrier_rf_hz,
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,
+            knowledge=self._estimator.knowledge(pivot),
+        )
+        found = solve_with_ground(
+            mirrors,
+            carrier_rf_hz=self._scenario.carrier_rf_hz,
             reflectors=(simulated_ground(self._scenario),) if estimate else (),
             calibration_enu_m=self._scenario.calibration_enu_m if self._scenario.calibration_receiver else None,
-            tone_count=self._waves.n_tone,
-            knowledge=self._estimator.knowledge(pivot),
             free_space=self._spreads(),
             propagation_speed_mps=self._scenario.radio.propagation_speed_mps,
             min_probability=0.0,

@@ -24,8 +24,8 @@ from rfpose.measurement import (
 )
 from rfpose.multilat import check_unambiguous
 from rfpose.multilat.ground import Reflector, range_shift_m
-from rfpose.multilat.rigid import Knowledge
-from rfpose.multilat.rigid.integers import Observation, solve_ladder
+from rfpose.multilat.rigid import MirrorProblem
+from rfpose.multilat.rigid.integers import solve_ladder
 from rfpose.scenario import Scenario
 
 __all__ = ["Plan", "make_plan"]
@@ -143,9 +143,35 @@ class Plan:
             shift[:, : self.waves.n_tone] -= mean[:, None]
         return shift
 
-    def knowledge(self, pivot_enu_m: FloatArray) -> Knowledge:
-        """Return what the solver is told, with surveyed pivots (row, xyz)."""
-        return self.estimator.knowledge(pivot_enu_m)
+    @property
+    def places_m(self) -> FloatArray:
+        """(mirror, receiver, xyz) where the solver believes receivers to be, from the pivot [m]."""
+        places = self.mirrors.receiver_mirror_m
+        return np.broadcast_to(places, (len(self.mirrors.pivot_enu_m), *places.shape[1:]))
+
+    def problem(self, range_m: FloatArray, surveyed_pivot_enu_m: FloatArray) -> MirrorProblem:
+        """Return what the solver gets, one row a draw and mirror; it begins at the expected poses.
+
+        Parameters
+        ----------
+        range_m : (draw, mirror, group, receiver, transmitter)
+            What is measured [m].
+        surveyed_pivot_enu_m : (draw, mirror, xyz)
+            What it is told [m].
+        """
+        n_draw, waves = len(range_m), self.waves
+        problem = MirrorProblem.of(
+            self.scenario.transmitter_enu_m,
+            np.tile(self.places_m, (n_draw, 1, 1)),
+            range_m.reshape(-1, *range_m.shape[2:]),
+            sigma_m=np.tile(self.sigma_m, (n_draw, 1, 1, 1)),
+            transmitter_sigma_m=self.transmitter_sigma_m,
+            clock_class=waves.clock_class,
+            start_pivot_enu_m=np.tile(self.mirrors.pivot_enu_m, (n_draw, 1)),
+            start_rot_enu_from_mirror=np.tile(self.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
+            knowledge=self.estimator.knowledge(surveyed_pivot_enu_m.reshape(-1, 3)),
+        )
+        return replace(problem, wavelength_m=waves.wavelength_m, is_carrier=waves.is_carrier)
 
     def gain(self) -> Gain:
         """Return what each range does to each normal at the working point."""
@@ -284,27 +310,9 @@ def _converter_share(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
 def _with_trusted_groups(plan: Plan) -> Plan:
     """Keep the wavelengths whose integers the solver resolves on every mirror."""
     mirrors, transmitter = plan.mirrors, plan.scenario.transmitter_enu_m
-    n_mirror = len(mirrors.pivot_enu_m)
-    distance = _ranges(transmitter, mirrors.receiver_enu_m)
-    places = np.broadcast_to(mirrors.receiver_mirror_m, (n_mirror, *mirrors.receiver_mirror_m.shape[1:]))
-    observations = [
-        Observation(
-            range_m=distance,
-            sigma_m=plan.sigma_m[:, g],
-            transmitter_sigma_m=np.broadcast_to(plan.transmitter_sigma_m[g], (n_mirror, len(transmitter))),
-            wavelength_m=plan.waves.wavelength_m[g],
-            clock_class=int(plan.waves.clock_class[g]),
-        )
-        for g in range(len(plan.waves.tone))
-    ]
-    solution = solve_ladder(
-        transmitter,
-        places,
-        observations,
-        start_pivot_enu_m=mirrors.pivot_enu_m,
-        start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
-        knowledge=plan.knowledge(mirrors.pivot_enu_m),
-    )
+    distance = _ranges(transmitter, mirrors.receiver_enu_m)[None, :, None]
+    exact = np.repeat(distance, len(plan.waves.tone), axis=2)
+    solution = solve_ladder(plan.problem(exact, mirrors.pivot_enu_m[None]))
     kept: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=0))
     return replace(
         plan,

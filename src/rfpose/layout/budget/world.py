@@ -15,7 +15,6 @@ from rfpose.layout.budget.plan import Plan
 from rfpose.multilat import range_differences, solve_poses
 from rfpose.multilat.ground import CalibrationSight, solve_with_ground
 from rfpose.multilat.rigid import solve_rigid
-from rfpose.multilat.rigid.integers import Observation
 
 __all__ = ["World"]
 
@@ -149,17 +148,7 @@ class World:
         if self.plan.reflects:
             return self._solve_ground(range_m, slice(None))
         plan, n_draw = self.plan, self.n_draw
-        poses = solve_rigid(
-            plan.scenario.transmitter_enu_m,
-            self._assumed_places(n_draw),
-            range_m.reshape(-1, *range_m.shape[2:]),
-            sigma_m=np.tile(plan.sigma_m, (n_draw, 1, 1, 1)),
-            transmitter_sigma_m=plan.transmitter_sigma_m,
-            clock_class=plan.waves.clock_class,
-            start_pivot_enu_m=np.tile(plan.mirrors.pivot_enu_m, (n_draw, 1)),
-            start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
-            knowledge=plan.knowledge(self.surveyed_pivot_enu_m.reshape(-1, 3)),
-        )
+        poses = solve_rigid(plan.problem(range_m, self.surveyed_pivot_enu_m))
         return poses.normal_enu.reshape(n_draw, -1, 3)
 
     def _calibrate(self, range_m: FloatArray) -> FloatArray:
@@ -186,41 +175,16 @@ class World:
         tones -= wavelength * np.rint((tones - range_m[:, :, : plan.waves.n_tone]) / wavelength)
         return out
 
-    def _assumed_places(self, n_draw: int) -> FloatArray:
-        mirrors = self.plan.mirrors
-        n_mirror = len(mirrors.pivot_enu_m)
-        return np.tile(
-            np.broadcast_to(mirrors.receiver_mirror_m, (n_mirror, *mirrors.receiver_mirror_m.shape[1:])), (n_draw, 1, 1)
-        )
-
     def _solve_ground(self, range_m: FloatArray, draws: slice) -> FloatArray:
         plan, n_draw = self.plan, len(range_m)
-        n_row = n_draw * range_m.shape[1]
         ground = plan.scenario.simulation.ground
         assert ground is not None
         coefficient = None if plan.estimates_ground else complex(*ground.coefficient)
-        common = plan.transmitter_sigma_m
-        observations = [
-            Observation(
-                range_m=range_m[:, :, g].reshape(n_row, *range_m.shape[3:]),
-                sigma_m=np.tile(plan.sigma_m[:, g], (n_draw, 1, 1)),
-                transmitter_sigma_m=np.broadcast_to(common[g], (n_row, common.shape[1])),
-                wavelength_m=plan.waves.wavelength_m[g],
-                clock_class=int(plan.waves.clock_class[g]),
-            )
-            for g in range(len(plan.waves.tone_hz))
-        ]
         solution = solve_with_ground(
-            plan.scenario.transmitter_enu_m,
-            self._assumed_places(n_draw),
-            observations,
+            plan.problem(range_m, self.surveyed_pivot_enu_m[draws]),
             carrier_rf_hz=plan.scenario.carrier_rf_hz,
-            start_pivot_enu_m=np.tile(plan.mirrors.pivot_enu_m, (n_draw, 1)),
-            start_rot_enu_from_mirror=np.tile(plan.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
             reflectors=(plan.reflector(coefficient),),
             calibration_enu_m=self._calibration_sight(np.repeat(np.arange(self.n_draw)[draws], range_m.shape[1])),
-            tone_count=plan.waves.n_tone,
-            knowledge=plan.knowledge(self.surveyed_pivot_enu_m[draws].reshape(-1, 3)),
             free_space=plan.scenario.simulation.path_loss == "free_space",
             min_probability=0.0,
             propagation_speed_mps=plan.scenario.radio.propagation_speed_mps,
@@ -261,6 +225,6 @@ class World:
             sigma_m=ranges.sigma_m,
             calibration_sigma_m=ranges.calibration_sigma_m,
             mirror_rows=[slice(k * n_receiver, (k + 1) * n_receiver) for k in range(n_mirror)],
-            receiver_mirror_m=list(self._assumed_places(1)),
+            receiver_mirror_m=list(plan.places_m),
         )
         return poses.normals.normal_enu.reshape(n_draw, n_mirror, 3)

@@ -4,13 +4,12 @@ from rfpose.multilat.ground._problem import CalibrationSight
 from rfpose.multilat.ground.bound import ground_bound
 from rfpose.multilat.ground.guard import guard_with_ground
 from rfpose.multilat.ground.model import LEVEL_GROUND, Reflector, Surface, fresnel_coefficient, range_shift_m
-from rfpose.multilat.ground.solve import GroundSolution, GroundStatus, solve_with_ground
+from rfpose.multilat.ground.solve import GroundSolution, solve_with_ground
 
 __all__ = [
     "LEVEL_GROUND",
     "CalibrationSight",
     "GroundSolution",
-    "GroundStatus",
     "Reflector",
     "Surface",
     "fresnel_coefficient",

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.ground._problem import Problem, State
+from rfpose.multilat.status import has_start
 
 __all__ = ["MAX_CONDITION", "find", "information", "refine", "retry", "trusted"]
 
@@ -39,7 +40,7 @@ def find(problem: Problem, state: State, turn: FloatArray) -> FloatArray:
     turn : (start, 3)
         Rotation vectors in the mirror frame from which a mirror is tried again [rad].
     """
-    usable = np.flatnonzero(state.status <= 2)
+    usable = np.flatnonzero(has_start(state.status))
     parameter = problem.first_parameter()
     if problem.n_parameter == 0 or not len(usable):
         return parameter
@@ -105,7 +106,7 @@ def retry(problem: Problem, start: State, state: State, parameter: FloatArray, t
     """Solve mirrors that failed, or fit far worse than the rest, again from starts turned about."""
     ratio = state.chi2 / np.maximum(problem.dof, 1.0)
     usual = _usual(problem, state)
-    rows = np.flatnonzero((start.status <= 2) & ~((state.status == 0) & (ratio <= usual)))
+    rows = np.flatnonzero(has_start(start.status) & ~((state.status == 0) & (ratio <= usual)))
     if not len(rows):
         return
     again = start.take(rows)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.jit import kernel, kernel_parallel, prange
-from rfpose.multilat.rigid._kernels import add_priors, factor, rotate, solve_factored
+from rfpose.multilat.rigid._kernels import OPEN, SOLVED, STUCK, add_priors, factor, rotate, solve_factored
 
 Float64 = npt.NDArray[np.float64]
 Complex128 = npt.NDArray[np.complex128]
@@ -414,7 +414,7 @@ def _fit(scene, mirrors, m, max_iteration, floor, pivot, rot, clock, cov, follow
             gradient,
         )
         if not math.isfinite(chi2):
-            return np.inf, used, 2
+            return np.inf, used, STUCK
         if chi2 > chi2_before * (1.0 + 1e-9) + 1e-6 and share > 1e-3:
             share *= 0.5
             _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
@@ -423,7 +423,7 @@ def _fit(scene, mirrors, m, max_iteration, floor, pivot, rot, clock, cov, follow
             for b in range(a + 1):
                 lower[a, b] = info[a, b]
         if not factor(lower, floor):
-            return chi2, used, 1
+            return chi2, used, OPEN
         for a in range(n_own):
             step[a] = gradient[a]
         solve_factored(lower, step)
@@ -439,8 +439,8 @@ def _fit(scene, mirrors, m, max_iteration, floor, pivot, rot, clock, cov, follow
         _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
         if decrement < 1e-4 and share == 1.0:
             _leave(lower, info, gradient, n_own, cov, follow, schur, rest)
-            return chi2 - decrement, used, 0
-    return min(chi2, chi2_before), used, 2
+            return chi2 - decrement, used, SOLVED
+    return min(chi2, chi2_before), used, STUCK
 
 
 @kernel
@@ -469,7 +469,7 @@ def _fit_from_turns(
     cov_try, follow_try, schur_try, rest_try = cov.copy(), follow.copy(), schur.copy(), rest.copy()
     about = np.empty(3)
     best = np.inf
-    status = 2
+    status = STUCK
     total = 0
     for s in range(turn.shape[0]):
         _copy(from_pivot, pivot_try)
@@ -492,10 +492,11 @@ def _fit_from_turns(
             rest_try,
         )
         total += used
-        if outcome == 1 and status != 0 and best == np.inf:
-            status = 1
+        if outcome == OPEN and status != SOLVED and best == np.inf:
+            status = OPEN
         # a solution beats every attempt that did not come to an end
-        if (outcome == 0 and (status != 0 or chi2 < best)) or (outcome == 2 and status != 0 and chi2 < best):
+        first = outcome == SOLVED and status != SOLVED
+        if first or (chi2 < best and (outcome == SOLVED or (outcome == STUCK and status != SOLVED))):
             best = chi2
             status = outcome
             _copy(pivot_try, pivot)
@@ -505,7 +506,7 @@ def _fit_from_turns(
             _copy(follow_try, follow)
             _copy(schur_try, schur)
             _copy(rest_try, rest)
-        if status == 0 and best < enough:
+        if status == SOLVED and best < enough:
             break
     return best, total, status
 
@@ -532,7 +533,7 @@ def fit_many(
     """`_fit_from_turns` for every mirror that has a start."""
     for index in prange(chi2.shape[0]):
         m = np.int64(index)  # one type for both passes of the compiler
-        if status[m] <= 2:
+        if status[m] == SOLVED or status[m] == OPEN or status[m] == STUCK:
             chi2[m], n_iteration[m], status[m] = _fit_from_turns(
                 scene,
                 mirrors,

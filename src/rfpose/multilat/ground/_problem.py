@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.ground import _kernels
-from rfpose.multilat.rigid.arrays import bias_information, clock_ties, pivot_prior, start_clock, weights
-from rfpose.multilat.rigid.integers import Observation
-from rfpose.multilat.rigid.knowledge import Knowledge
+from rfpose.multilat.rigid.problem import MirrorProblem, start_clock
 
 __all__ = ["CalibrationSight", "Problem", "State", "build"]
 
@@ -259,69 +257,29 @@ class Problem:
 
 
 def build(
-    scene: _kernels.Scene,
-    places: FloatArray,
-    observations: Sequence[Observation],
-    range_m: Sequence[FloatArray],
-    pivot: FloatArray,
-    rot: FloatArray,
-    *,
-    calibration: CalibrationSight | npt.ArrayLike | None,
-    known: Knowledge,
+    scene: _kernels.Scene, mirrors: MirrorProblem, *, calibration: CalibrationSight | npt.ArrayLike | None
 ) -> tuple[Problem, FloatArray]:
-    """Lay out observations with their integers resolved; also clocks (mirror, class, receiver) that fit the poses."""
+    """Lay out mirrors with their integers resolved; also clocks (mirror, class, receiver) that fit where they begin."""
     calibration = CalibrationSight.checked(calibration)
-    z = np.stack(range_m, axis=1)
-    n_mirror, n_group, _, n_transmitter = z.shape
-    weight = weights(z, np.stack([np.broadcast_to(o.sigma_m, z[:, 0].shape) for o in observations], axis=1))
-    common_sigma = np.stack(
-        [np.broadcast_to(o.transmitter_sigma_m, (n_mirror, n_transmitter)) for o in observations], axis=1
-    )
-    bias_info = bias_information(common_sigma, (n_mirror, n_group, n_transmitter))
-    classes = np.array([o.clock_class for o in observations], np.int64)
-    n_class = int(classes.max()) + 1
-    own, tie = clock_ties(known.clock_sigma_m, weight, bias_info, classes, n_class)
-    seen = np.stack([np.any(weight[:, classes == k] > 0.0, axis=(1, 3)) for k in range(n_class)], axis=1)
-    prior, prior_info = pivot_prior(known, n_mirror)
-    clock = start_clock(scene.transmitter, places, pivot, rot, z, classes, n_class)
-    mirrors = _kernels.Mirrors(
-        receiver_mirror=np.ascontiguousarray(places),
-        z=np.nan_to_num(z),
-        weight=weight,
-        bias_info=bias_info,
-        clock_class=classes,
-        pivot_prior=prior,
-        pivot_info=prior_info,
-        roll_info=known.roll_sigma_rad**-2 if known.two_axis else 0.0,
-        clock_own=own,
-        clock_tie=tie,
+    equations = mirrors.equations
+    clock = start_clock(mirrors, mirrors.start_pivot_enu_m, mirrors.start_rot_enu_from_mirror)
+    arrays = _kernels.Mirrors(
+        receiver_mirror=np.ascontiguousarray(mirrors.receiver_mirror_m),
+        z=np.nan_to_num(mirrors.range_m),
+        weight=equations.weight,
+        bias_info=equations.bias_info,
+        clock_class=mirrors.clock_class,
+        pivot_prior=equations.pivot,
+        pivot_info=equations.pivot_info,
+        roll_info=equations.roll_info,
+        clock_own=equations.clock_own,
+        clock_tie=equations.clock_tie,
         clock_prior=clock.copy(),
-        frame=np.zeros(n_mirror, np.int64) if calibration.frame is None else _rank(calibration.frame),
+        frame=np.zeros(len(clock), np.int64) if calibration.frame is None else _rank(calibration.frame),
     )
-    dof = _dof(weight, bias_info, seen, classes, known)
-    return Problem(scene=scene, mirrors=mirrors, calibration=calibration, dof=dof), clock
+    return Problem(scene=scene, mirrors=arrays, calibration=calibration, dof=equations.dof), clock
 
 
 def _rank(frame: IntArray) -> IntArray:
     """Return each frame's place among those there are."""
     return np.asarray(np.unique(frame, return_inverse=True)[1].reshape(-1), np.int64)
-
-
-def _dof(
-    weight: FloatArray, bias_info: FloatArray, seen: FloatArray, classes: IntArray, known: Knowledge
-) -> FloatArray:
-    """Count measurements and priors less unknowns.
-
-    Without a calibrated transmitter a class's common clock is no unknown of its own: the transmitters' errors hold it.
-    """
-    observed = weight > 0.0
-    n = observed.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0
-    n -= (np.any(observed, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
-    for k in range(seen.shape[1]):
-        clocks = seen[:, k].sum(axis=1)
-        if np.isfinite(known.clock_sigma_m):
-            clocks = np.minimum(clocks, 1)
-        held = ~np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
-        n -= np.maximum(clocks - held, 0)
-    n += 3 * (known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)) + known.two_axis
-    return np.asarray(n)

@@ -26,7 +26,8 @@ from rfpose.multilat.integrity.hypotheses import (
     tilt_quantile,
     widened,
 )
-from rfpose.multilat.rigid import RigidPoses, RigidStatus
+from rfpose.multilat.rigid import RigidPoses
+from rfpose.multilat.status import PoseStatus, has_start
 
 __all__ = ["guard_with_ground"]
 
@@ -155,7 +156,9 @@ class _Guard:
 
     def _retry(self, problem: Problem, state: State, rows: IntArray) -> None:
         dof = np.maximum(self.dof[rows], 1.0)
-        ruined = np.flatnonzero((state.status > 2) | (state.chi2 > 30.0 * dof) & (self.state.chi2[rows] > 30.0 * dof))
+        ruined = np.flatnonzero(
+            ~has_start(state.status) | (state.chi2 > 30.0 * dof) & (self.state.chi2[rows] > 30.0 * dof)
+        )
         if not ruined.size:
             return
         again = self.state.take(rows[ruined])
@@ -254,7 +257,7 @@ class _Guard:
             ("dof", self.dof),
         ):
             poses[name][changed] = values[changed]
-        poses["status"][changed] = RigidStatus.OK
+        poses["status"][changed] = PoseStatus.OK
         guarded = RigidPoses(**{name: read_only(array) for name, array in poses.items()})
         return GuardedPoses(
             poses=widened(guarded, np.asarray(changed), level, self.missed),

@@ -7,8 +7,8 @@ import numpy.typing as npt
 from scipy.special import erfc
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.rigid.integers import Observation, common_offset
-from rfpose.multilat.rigid.pose import Knowledge
+from rfpose.multilat.rigid.integers import common_offset
+from rfpose.multilat.rigid.problem import Knowledge, Observation
 
 __all__ = ["resolve"]
 

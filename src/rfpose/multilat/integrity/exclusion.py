@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray, as_float_array, read_only
+from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.integrity.hypotheses import (
     PRIORS,
@@ -24,7 +24,8 @@ from rfpose.multilat.integrity.hypotheses import (
     tilt_quantile,
     widened,
 )
-from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus, solve_rigid
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, RigidPoses, solve_rigid
+from rfpose.multilat.status import PoseStatus
 
 __all__ = ["GuardedPoses", "IntegrityStatus", "TransmitterStatus", "solve_with_integrity"]
 
@@ -149,16 +150,8 @@ class GuardedPoses:
 
 
 def solve_with_integrity(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    range_m: npt.ArrayLike,
+    problem: MirrorProblem,
     *,
-    sigma_m: npt.ArrayLike,
-    transmitter_sigma_m: npt.ArrayLike,
-    clock_class: npt.ArrayLike,
-    start_pivot_enu_m: npt.ArrayLike,
-    start_rot_enu_from_mirror: npt.ArrayLike,
-    knowledge: Knowledge | None = None,
     false_alarm: float = 1e-2,
     missed_detection: float = 1e-3,
     max_excluded: int = 4,
@@ -167,9 +160,8 @@ def solve_with_integrity(
 
     Parameters
     ----------
-    transmitter_enu_m, receiver_mirror_m, range_m, sigma_m, transmitter_sigma_m, clock_class, start_pivot_enu_m, \
-start_rot_enu_from_mirror, knowledge
-        As in `rfpose.multilat.rigid.solve_rigid`.
+    problem
+        As for `rfpose.multilat.rigid.solve_rigid`.
     false_alarm
         Probability that a mirror without any error is not found OK. Half of it goes to chi² of all residuals, half
         is shared by the single tests.
@@ -180,92 +172,33 @@ start_rot_enu_from_mirror, knowledge
 
     Raises
     ------
-    InvalidInputError, GeometryError
-        As `solve_rigid`; a probability outside (0, 1), a negative ``max_excluded``.
+    InvalidInputError
+        A probability outside (0, 1), a negative ``max_excluded``.
     """
     for name, value in (("false_alarm", false_alarm), ("missed_detection", missed_detection)):
         if not 0.0 < value < 1.0:
             raise InvalidInputError(f"`{name}` must lie between 0 and 1, got {value}")
     if max_excluded < 0:
         raise InvalidInputError(f"`max_excluded` must not be negative, got {max_excluded}")
-    known = knowledge or Knowledge()
-    poses = solve_rigid(
-        transmitter_enu_m,
-        receiver_mirror_m,
-        range_m,
-        sigma_m=sigma_m,
-        transmitter_sigma_m=transmitter_sigma_m,
-        clock_class=clock_class,
-        start_pivot_enu_m=start_pivot_enu_m,
-        start_rot_enu_from_mirror=start_rot_enu_from_mirror,
-        knowledge=known,
-    )
-    guard = _Guard(
-        _problem(transmitter_enu_m, receiver_mirror_m, range_m, sigma_m, transmitter_sigma_m, clock_class, known),
-        poses,
-        np.asarray(start_pivot_enu_m, np.float64),
-        np.asarray(start_rot_enu_from_mirror, np.float64),
-        false_alarm,
-        missed_detection,
-    )
+    guard = _Guard(problem, solve_rigid(problem), false_alarm, missed_detection)
     guard.run(max_excluded)
     guard.take_back()
     return guard.result()
 
 
-def _problem(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    range_m: npt.ArrayLike,
-    sigma_m: npt.ArrayLike,
-    transmitter_sigma_m: npt.ArrayLike,
-    clock_class: npt.ArrayLike,
-    known: Knowledge,
-) -> Problem:
-    """Arrays in one shape; `solve_rigid` has checked them."""
-    z = np.array(range_m, np.float64)
-    n_mirror, n_group, n_receiver, n_transmitter = z.shape
-    sigma = np.broadcast_to(np.asarray(sigma_m, np.float64), z.shape)
-    error = np.broadcast_to(np.asarray(transmitter_sigma_m, np.float64), (n_mirror, n_group, n_transmitter))
-    seen = np.isfinite(z) & np.isfinite(sigma)
-    with np.errstate(divide="ignore"):
-        bias_info = np.where(np.isnan(error), 0.0, error**-2.0)
-    if known.pivot_enu_m is not None:
-        known = replace(known, pivot_enu_m=np.broadcast_to(known.pivot_enu_m, (n_mirror, 3)))
-    return Problem(
-        transmitter=as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3)),
-        places=np.array(np.broadcast_to(np.asarray(receiver_mirror_m, np.float64), (n_mirror, n_receiver, 3))),
-        z=np.where(seen, z, 0.0),
-        weight=np.where(seen, np.where(seen, sigma, 1.0) ** -2.0, 0.0),
-        bias_info=bias_info,
-        classes=np.asarray(clock_class, np.int64),
-        known=known,
-        dropped=np.zeros((n_mirror, len(PRIORS)), np.bool_),
-    )
-
-
 class _Guard:
     """State of the loop over all mirrors."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        poses: RigidPoses,
-        start_pivot: FloatArray,
-        start_rot: FloatArray,
-        false_alarm: float,
-        missed: float,
-    ) -> None:
-        n_mirror, _, n_receiver, n_transmitter = problem.z.shape
-        self.problem = problem
-        self.start_pivot = np.broadcast_to(start_pivot, (n_mirror, 3))
-        self.start_rot = np.broadcast_to(start_rot, (n_mirror, 3, 3))
+    def __init__(self, given: MirrorProblem, poses: RigidPoses, false_alarm: float, missed: float) -> None:
+        n_mirror, _, n_receiver, n_transmitter = given.range_m.shape
+        self.given = given
+        self.problem = problem = Problem.of(given)
         self.poses = {f.name: np.array(getattr(poses, f.name)) for f in fields(RigidPoses)}
         self.global_alarm = false_alarm / 2.0
         self.single_alarm = false_alarm / 2.0 / (n_transmitter * (1 + n_receiver) + len(PRIORS))
         self.missed = missed
         self.status = np.full(n_mirror, IntegrityStatus.NOT_SOLVED, np.int8)
-        self.status[poses.status == RigidStatus.OK] = IntegrityStatus.OK
+        self.status[poses.status == PoseStatus.OK] = IntegrityStatus.OK
         self.transmitter_status = np.zeros((n_mirror, n_transmitter), np.int8)
         received = np.any(problem.weight > 0.0, axis=(1, 2))
         self.transmitter_status[~received] = TransmitterStatus.NOT_RECEIVED
@@ -273,7 +206,7 @@ class _Guard:
         self.probability = np.full(n_mirror, np.nan)
         self.own_level = np.full(n_mirror, np.inf)
         self.worst = np.full(n_mirror, -1, np.int64)
-        self.original = problem.weight.copy()
+        self.original = given.equations.weight
         # what was left out, in order: mirrors, hypothesis, receiver (−1: all)
         self.history: list[tuple[IntArray, IntArray, IntArray]] = []
         # other explanations of what was found: normal and its uncertainty if that had been left out instead
@@ -297,26 +230,16 @@ class _Guard:
         self, rows: IntArray, weight: FloatArray, dropped: BoolArray, *, from_start: bool = False
     ) -> dict[str, npt.NDArray[Any]]:
         """Solve some mirrors with other weights and priors, from where they are or from their first start."""
-        problem = self.problem
         out: dict[str, npt.NDArray[Any]] = {k: v[rows].copy() for k, v in self.poses.items()}
         for pattern in np.unique(dropped, axis=0):
             at = np.flatnonzero((dropped == pattern).all(axis=1))
             pick = rows[at]
-            seen = weight[at] > 0.0
-            here = np.isfinite(self.poses["pivot_enu_m"][pick]).all(axis=1) & (not from_start)
-            poses = solve_rigid(
-                problem.transmitter,
-                problem.places[pick],
-                np.where(seen, problem.z[pick], np.nan),
-                sigma_m=np.where(seen, np.where(seen, weight[at], 1.0) ** -0.5, np.nan),
-                transmitter_sigma_m=_sigma(problem.bias_info[pick]),
-                clock_class=problem.classes,
-                start_pivot_enu_m=np.where(here[:, None], self.poses["pivot_enu_m"][pick], self.start_pivot[pick]),
-                start_rot_enu_from_mirror=np.where(
-                    here[:, None, None], self.poses["rot_enu_from_mirror"][pick], self.start_rot[pick]
-                ),
-                knowledge=self._known(pick, pattern),
-            )
+            some = self.given.take(pick)
+            left = np.where(weight[at] > 0.0, some.range_m, np.nan)
+            some = replace(some, range_m=left, knowledge=self._known(pick, pattern))
+            if not from_start:
+                some = some.started(self.poses["pivot_enu_m"][pick], self.poses["rot_enu_from_mirror"][pick])
+            poses = solve_rigid(some)
             for name, array in out.items():
                 array[at] = getattr(poses, name)
         return out
@@ -347,8 +270,8 @@ class _Guard:
 
     def run(self, max_excluded: int) -> None:
         """Test; leave out the likeliest culprit; solve again; until all is consistent or nothing helps."""
-        started = np.isfinite(self.start_pivot).all(axis=1) & np.isfinite(self.start_rot).all(axis=(1, 2))
-        lost = np.flatnonzero((self.poses["status"] == RigidStatus.NOT_CONVERGED) & started)
+        started = self.given.has_start
+        lost = np.flatnonzero((self.poses["status"] == PoseStatus.NOT_CONVERGED) & started)
         rows = np.flatnonzero(self.status != IntegrityStatus.NOT_SOLVED)
         for step in range(max_excluded + 1):
             bad, verdict, single = self._test(rows)
@@ -392,7 +315,7 @@ class _Guard:
             else:
                 dropped[:, h - n_transmitter] = True
             poses = self._solve(rows[at], weight, dropped, from_start=True)
-            chi2 = np.where(poses["status"] == RigidStatus.OK, np.asarray(poses["chi2"], np.float64), np.inf)
+            chi2 = np.where(poses["status"] == PoseStatus.OK, np.asarray(poses["chi2"], np.float64), np.inf)
             better = np.flatnonzero(chi2 < best[at])
             best[at[better]], choice[at[better]] = chi2[better], h
             self._accept(rows[at[better]], weight[better], dropped[better], {k: v[better] for k, v in poses.items()})
@@ -441,7 +364,7 @@ class _Guard:
             dropped = self.problem.dropped[rows[at]]
             poses = self._solve(rows[at], weight, dropped)
             good = np.flatnonzero(
-                (poses["status"] == RigidStatus.OK) & (poses["chi2"] < self.poses["chi2"][rows[at]] + 0.1 * GROSS)
+                (poses["status"] == PoseStatus.OK) & (poses["chi2"] < self.poses["chi2"][rows[at]] + 0.1 * GROSS)
             )
             self._accept(rows[at[good]], weight[good], dropped[good], {k: v[good] for k, v in poses.items()})
         return np.asarray(receiver)
@@ -472,7 +395,7 @@ class _Guard:
         whole = ~is_prior & (receiver < 0)
         weight[at[whole], :, :, who[whole]] = 0.0
         poses = self._solve(rows, weight, dropped)
-        solved = np.flatnonzero((poses["status"] == RigidStatus.OK) & (verdict.dof[at, choice] > 0))
+        solved = np.flatnonzero((poses["status"] == PoseStatus.OK) & (verdict.dof[at, choice] > 0))
         self._remember_others(rows[solved], _pick(verdict, solved), choice[solved])
         self._accept(
             rows[solved], weight[solved], dropped[solved], {name: array[solved] for name, array in poses.items()}
@@ -554,7 +477,7 @@ class _Guard:
             weight[k, :, :, choice[k]] = self.original[rows[k], :, :, choice[k]]
         poses = self._solve(rows, weight, dropped)
         problem = replace(self.problem.rows(rows), weight=weight, dropped=dropped)
-        solved = poses["status"] == RigidStatus.OK
+        solved = poses["status"] == PoseStatus.OK
         safe = {name: np.where(_like(solved, v), v, self.poses[name][rows]) for name, v in poses.items()}
         verdict = judge(problem, self._as_poses(safe))
         alarm, _, overall = self._alarm(problem, verdict, np.asarray(safe["chi2"], np.float64))

@@ -15,7 +15,8 @@ from scipy.special import chdtri, chndtrinc, gammaincc, gammaln
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.integrity import _kernels
-from rfpose.multilat.rigid import Knowledge, RigidPoses
+from rfpose.multilat.rigid import Knowledge, MirrorProblem, RigidPoses
+from rfpose.multilat.rigid.problem import degrees_of_freedom
 
 __all__ = [
     "PRIORS",
@@ -70,12 +71,26 @@ class Problem:
     known: Knowledge
     dropped: BoolArray
 
+    @classmethod
+    def of(cls, mirrors: MirrorProblem) -> Problem:
+        """Return what is tested of mirrors, nothing left out yet."""
+        equations = mirrors.equations
+        return cls(
+            transmitter=mirrors.transmitter_enu_m,
+            places=mirrors.receiver_mirror_m,
+            z=np.where(equations.weight > 0.0, mirrors.range_m, 0.0),
+            weight=equations.weight.copy(),
+            bias_info=equations.bias_info,
+            classes=mirrors.clock_class,
+            known=mirrors.knowledge,
+            dropped=np.zeros((len(mirrors.range_m), len(PRIORS)), np.bool_),
+        )
+
     @property
     def has_prior(self) -> BoolArray:
         """(mirror, prior) which of `PRIORS` is used."""
         known = self.known
-        pivot = known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m)
-        given = np.array([pivot, known.two_axis, np.isfinite(known.clock_sigma_m)])
+        given = np.array([known.has_pivot, known.two_axis, np.isfinite(known.clock_sigma_m)])
         return np.asarray(given & ~self.dropped)
 
     def rows(self, index: npt.NDArray[np.int64]) -> Problem:
@@ -113,15 +128,9 @@ class Problem:
 
     def dof(self) -> IntArray:
         """(mirror,) observations and priors less unknowns."""
-        n_receiver = self.z.shape[2]
-        n_class = int(self.classes.max()) + 1
-        seen = self.weight > 0.0
-        free_error = seen.any(axis=2) & (self.bias_info == 0.0)
-        n = seen.sum(axis=(1, 2, 3)) - free_error.sum(axis=(1, 2)) - 6 - n_class * n_receiver
-        n += self.has_prior @ np.array([3, 1, n_class * (n_receiver - 1)])
-        for k in range(n_class):
-            n += ~np.any(self.bias_info[:, self.classes == k] > 0.0, axis=(1, 2))
-        return np.asarray(n)
+        has = self.has_prior
+        n = degrees_of_freedom(self.weight, self.bias_info, self.classes, tied=has[:, 2], n_prior=has[:, :2] @ [3, 1])
+        return n.astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

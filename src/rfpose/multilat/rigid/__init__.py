@@ -1,21 +1,15 @@
 """Poses of rigid mirrors from all phases of their receivers at once."""
 
 from rfpose.multilat.rigid.places import ReceiverPlaces, places_bound, refine_places
-from rfpose.multilat.rigid.pose import (
-    Knowledge,
-    RigidPoses,
-    RigidStatus,
-    full_covariance,
-    rigid_bound,
-    solve_rigid,
-    tilt_sigma_rad,
-)
+from rfpose.multilat.rigid.pose import RigidPoses, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem, Observation
 
 __all__ = [
     "Knowledge",
+    "MirrorProblem",
+    "Observation",
     "ReceiverPlaces",
     "RigidPoses",
-    "RigidStatus",
     "full_covariance",
     "places_bound",
     "refine_places",

@@ -16,6 +16,9 @@ import math
 import numpy as np
 
 from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.multilat.status import PoseStatus
+
+SOLVED, OPEN, STUCK = int(PoseStatus.OK), int(PoseStatus.UNDETERMINED), int(PoseStatus.NOT_CONVERGED)
 
 
 @kernel
@@ -245,7 +248,7 @@ def _solve_one(
     old_pivot, old_rot, old_clock = pivot.copy(), rot.copy(), clock.copy()
     chi2_before = np.inf
     shrink = 1.0
-    status = 2
+    status = STUCK
     chi2 = np.nan
     used = 0
     for iteration in range(max_iteration):
@@ -258,7 +261,7 @@ def _solve_one(
             pivot, rot, clock, pivot_prior, pivot_info, roll_info, clock_own, clock_tie, clock_prior, info, gradient
         )
         if not math.isfinite(chi2):
-            return chi2, used, 2
+            return chi2, used, STUCK
         if chi2 > chi2_before * (1.0 + 1e-9) + 1e-6 and shrink > 1e-3:
             # too long a step: halve it from where it began
             shrink *= 0.5
@@ -270,7 +273,7 @@ def _solve_one(
                     clock[k, r] = old_clock[k, r] + shrink * step[6 + k * n_receiver + r]
             continue
         if not factor(info, floor):
-            return chi2, used, 1
+            return chi2, used, OPEN
         for a in range(n):
             step[a] = gradient[a]
         solve_factored(info, step)
@@ -293,7 +296,7 @@ def _solve_one(
                 clock[k, r] += shrink * step[6 + k * n_receiver + r]
         # the step promises less than a thousandth of a sigma
         if decrement < 1e-6 and shrink == 1.0:
-            status = 0
+            status = SOLVED
             chi2 -= decrement
             pose_covariance(info, cov)
             break
@@ -326,7 +329,7 @@ def solve_many(
 ):
     """`_solve_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
     for m in prange(z.shape[0]):
-        if status[m] != 0:
+        if status[m] != SOLVED:
             continue
         chi2[m], n_iteration[m], status[m] = _solve_one(
             transmitter,

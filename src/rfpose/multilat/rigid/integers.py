@@ -17,7 +17,8 @@ from scipy.special import chdtrc, erfc
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid.pose import Knowledge, RigidPoses, RigidStatus, solve_rigid
+from rfpose.multilat.rigid.pose import RigidPoses, solve_rigid
+from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem, Observation
 from rfpose.multilat.rigid.search import (
     DELAY_REACH_M,
     Candidates,
@@ -26,8 +27,9 @@ from rfpose.multilat.rigid.search import (
     predict,
     search_integers,
 )
+from rfpose.multilat.status import PoseStatus
 
-__all__ = ["IntegerMethod", "Observation", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
+__all__ = ["IntegerMethod", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -73,31 +75,6 @@ class IntegerMethod(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Observation:
-    """One wavelength's phases as ranges: a tone, or the carrier.
-
-    Attributes
-    ----------
-    range_m : (mirror, receiver, transmitter)
-        −λ/(2π) × phase, up to whole wavelengths [m]; NaN = not received.
-    sigma_m : (mirror, receiver, transmitter)
-        Own noise [m].
-    transmitter_sigma_m : (mirror, transmitter)
-        Error common to all receivers [m]; infinity where nothing calibrates it.
-    wavelength_m : (transmitter,)
-        [m].
-    clock_class
-        0 for tones, 1 for the carrier.
-    """
-
-    range_m: FloatArray
-    sigma_m: FloatArray
-    transmitter_sigma_m: FloatArray
-    wavelength_m: FloatArray
-    clock_class: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RigidSolution:
     """Poses, and which wavelengths they rest on.
 
@@ -115,7 +92,7 @@ class RigidSolution:
         Where integers were searched: what the data leave to the runners-up, afterwards; else NaN.
     adop_cycles : (mirror, observation)
         Where integers were searched: their ambiguity dilution of precision; else NaN.
-    range_m : one (mirror, receiver, transmitter) an observation
+    range_m : (mirror, group, receiver, transmitter)
         Resolved ranges, NaN where left out [m]. Whole wavelengths that a clock or a transmitter's own error takes up
         are as they happen to be.
     """
@@ -126,7 +103,7 @@ class RigidSolution:
     method: IntArray
     odds_against: FloatArray
     adop_cycles: FloatArray
-    range_m: tuple[FloatArray, ...]
+    range_m: FloatArray
 
 
 def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -160,40 +137,22 @@ def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike
     return origin, rot
 
 
-def solve_ladder(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    observations: list[Observation],
-    *,
-    start_pivot_enu_m: npt.ArrayLike,
-    start_rot_enu_from_mirror: npt.ArrayLike,
-    knowledge: Knowledge | None = None,
-    wrong_risk: float = 1e-6,
-    search: bool = True,
-) -> RigidSolution:
+def solve_ladder(problem: MirrorProblem, *, wrong_risk: float = 1e-6, search: bool = True) -> RigidSolution:
     """Solve poses from the coarsest wavelength down.
 
     Parameters
     ----------
-    transmitter_enu_m : (transmitter, xyz)
-        [m].
-    receiver_mirror_m : (mirror, receiver, xyz)
-        From the pivot, in the mirror frame [m].
-    observations
-        Coarsest first; the first one's integers must be resolved already.
-    start_pivot_enu_m, start_rot_enu_from_mirror : (mirror, xyz), (mirror, 3, 3)
-        Where to begin.
-    knowledge
-        Clocks, pivot, mount.
+    problem
+        The first wavelength's integers must be resolved already.
     wrong_risk
-        Largest probability that any integer of an observation is wrong, for it to be used.
+        Largest probability that any integer of a wavelength is wrong, for it to be used.
     search
         Where rounding is not safe, find a mirror's integers together, by least squares [1]_ [2]_.
 
     Raises
     ------
     InvalidInputError
-        No observation, or shapes that do not fit.
+        ``wrong_risk`` is no probability.
 
     Notes
     -----
@@ -206,21 +165,12 @@ def solve_ladder(
     .. [2] Teunissen, Integer least-squares theory for the GNSS compass, J. Geodesy 84 (2010) 433–447: the receivers'
        known places constrain the search.
     """
-    if not observations:
-        raise InvalidInputError("`observations` must hold at least one wavelength")
     if not 0.0 < wrong_risk < 1.0:
         raise InvalidInputError(f"`wrong_risk` must lie between 0 and 1, got {wrong_risk}")
-    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
-    ladder = _Ladder(transmitter, places, observations, knowledge or Knowledge(), wrong_risk)
-    poses = ladder.solve(
-        np.arange(len(places)),
-        [np.array(observations[0].range_m)[:, None]],
-        start_pivot_enu_m,
-        start_rot_enu_from_mirror,
-    )
-    for k in range(1, len(observations)):
-        poses = ladder.climb(k, poses, start_pivot_enu_m, start_rot_enu_from_mirror, search=search)
+    ladder = _Ladder(problem, wrong_risk)
+    poses = ladder.solve(np.arange(len(problem.range_m)), [problem.range_m[:, :1]], problem)
+    for k in range(1, len(problem.clock_class)):
+        poses = ladder.climb(k, poses, search=search)
     return RigidSolution(
         poses=poses,
         fixed=ladder.method != IntegerMethod.FLOAT,
@@ -228,103 +178,64 @@ def solve_ladder(
         method=ladder.method,
         odds_against=ladder.odds,
         adop_cycles=ladder.adop,
-        range_m=tuple(ladder.resolved),
+        range_m=np.stack(ladder.resolved, axis=1),
     )
 
 
 class _Ladder:
     """The state of a climb: which integers are resolved so far, how, and at what risk."""
 
-    def __init__(
-        self,
-        transmitter: FloatArray,
-        places: FloatArray,
-        observations: list[Observation],
-        known: Knowledge,
-        wrong_risk: float,
-    ) -> None:
-        shape = (len(places), len(observations))
-        self.transmitter, self.places, self.known, self.limit = transmitter, places, known, wrong_risk
-        self.observations = observations
-        self.resolved = [np.full(o.range_m.shape, np.nan) for o in observations]
-        self.resolved[0] = np.array(observations[0].range_m)
+    def __init__(self, problem: MirrorProblem, wrong_risk: float) -> None:
+        shape = problem.range_m.shape[:2]
+        self.problem, self.known, self.limit = problem, problem.knowledge, wrong_risk
+        self.observations = [problem.observation(k) for k in range(shape[1])]
+        self.resolved = [np.full(o.range_m.shape, np.nan) for o in self.observations]
+        self.resolved[0] = np.array(problem.range_m[:, 0])
         self.method = np.full(shape, IntegerMethod.FLOAT, np.int64)
         self.method[:, 0] = IntegerMethod.GIVEN
         self.risk = np.ones(shape)
         self.risk[:, 0] = 0.0
         self.odds, self.adop = np.full(shape, np.nan), np.full(shape, np.nan)
 
-    def solve(
-        self,
-        mirrors: IntArray,
-        ranges: list[FloatArray],
-        start_pivot_enu_m: npt.ArrayLike,
-        start_rot_enu_from_mirror: npt.ArrayLike,
-    ) -> RigidPoses:
-        """Solve some mirrors with the first observations; each of ``ranges`` is (mirror, candidate, …).
+    def solve(self, mirrors: IntArray, ranges: list[FloatArray], start: MirrorProblem | RigidPoses) -> RigidPoses:
+        """Solve some mirrors with the first wavelengths; each of ``ranges`` is (mirror, candidate, …).
 
-        Rows of the result are mirror × candidate, of the start too, where it has as many.
+        They begin at poses, where there are any, else where the problem does. The result's rows are mirror × candidate.
         """
-        used = self.observations[: len(ranges)]
         repeat = max(r.shape[1] for r in ranges)
         rows = np.repeat(mirrors, repeat)
-        pivot = self.known.pivot_enu_m
         shape = (len(mirrors), repeat, *ranges[0].shape[2:])
-        return solve_rigid(
-            self.transmitter,
-            self.places[rows],
-            np.stack([np.broadcast_to(r, shape).reshape(-1, *shape[2:]) for r in ranges], axis=1),
-            sigma_m=np.stack([o.sigma_m[rows] for o in used], axis=1),
-            transmitter_sigma_m=np.stack([o.transmitter_sigma_m[rows] for o in used], axis=1),
-            clock_class=[o.clock_class for o in used],
-            start_pivot_enu_m=start_pivot_enu_m,
-            start_rot_enu_from_mirror=start_rot_enu_from_mirror,
-            knowledge=self.known if pivot is None else replace(self.known, pivot_enu_m=_rows_of(pivot, rows)),
-        )
+        z = np.stack([np.broadcast_to(r, shape).reshape(-1, *shape[2:]) for r in ranges], axis=1)
+        some = replace(self.problem.groups(slice(len(ranges))).take(rows), range_m=z)
+        if isinstance(start, RigidPoses):
+            some = some.started(start.pivot_enu_m[rows], start.rot_enu_from_mirror[rows])
+        return solve_rigid(some)
 
-    def climb(
-        self,
-        k: int,
-        poses: RigidPoses,
-        start_pivot_enu_m: npt.ArrayLike,
-        start_rot_enu_from_mirror: npt.ArrayLike,
-        *,
-        search: bool,
-    ) -> RigidPoses:
+    def climb(self, k: int, poses: RigidPoses, *, search: bool) -> RigidPoses:
         """Resolve observation k where that is safe, and solve with it."""
         observation = self.observations[k]
-        prediction = predict(self.transmitter, self.places, poses)
+        prediction = predict(self.problem.transmitter_enu_m, self.problem.receiver_mirror_m, poses)
         ranges, self.risk[:, k] = _round(observation, prediction, self.known)
         rounding_risk = self.risk[:, k].copy()
         limit = min(self.limit, _SAFE_ROUNDING) if search else self.limit
         self._take_rounded(k, ranges, np.less_equal(rounding_risk, limit))
-        unsafe = np.flatnonzero((self.method[:, k] == IntegerMethod.FLOAT) & (poses.status == RigidStatus.OK))
+        unsafe = np.flatnonzero((self.method[:, k] == IntegerMethod.FLOAT) & (poses.status == PoseStatus.OK))
         calibrated = bool(np.isfinite(observation.transmitter_sigma_m).all())
         if search and len(unsafe) and can_search(calibrated, observation.wavelength_m):
             self._search(k, unsafe, poses, prediction)
         left: BoolArray = np.equal(self.method[:, k], IntegerMethod.FLOAT) & (rounding_risk <= self.limit)
         self._take_rounded(k, ranges, left)
-        everyone = np.arange(len(self.places))
-        solution = self.solve(
-            everyone,
-            [r[:, None] for r in self.resolved[: k + 1]],
-            _or(poses.pivot_enu_m, start_pivot_enu_m),
-            _or(poses.rot_enu_from_mirror, start_rot_enu_from_mirror),
-        )
+        everyone = np.arange(len(self.problem.range_m))
+        solution = self.solve(everyone, [r[:, None] for r in self.resolved[: k + 1]], poses)
         # a coarse wavelength may have led into another minimum, which the finer one cannot leave but shows
         lost = np.flatnonzero(_is_unlikely(solution))
         if len(lost):
-            again = self.solve(
-                lost,
-                [r[lost][:, None] for r in self.resolved[: k + 1]],
-                np.broadcast_to(np.asarray(start_pivot_enu_m, np.float64), solution.pivot_enu_m.shape)[lost],
-                np.broadcast_to(np.asarray(start_rot_enu_from_mirror), solution.rot_enu_from_mirror.shape)[lost],
-            )
+            again = self.solve(lost, [r[lost][:, None] for r in self.resolved[: k + 1]], self.problem)
             with np.errstate(invalid="ignore"):
                 keep = ~(again.chi2 < np.where(np.isfinite(solution.chi2[lost]), solution.chi2[lost], np.inf))
             solution = _placed(solution, lost[~keep], _taken(again, np.flatnonzero(~keep)))
         # what made a solved mirror unsolvable is not used for it
-        worse = (poses.status == RigidStatus.OK) & (solution.status != RigidStatus.OK)
+        worse = (poses.status == PoseStatus.OK) & (solution.status != PoseStatus.OK)
         self.method[worse, k] = IntegerMethod.FLOAT
         self.resolved[k][worse] = np.nan
         return _merge(solution, poses, worse)
@@ -372,14 +283,8 @@ class _Ladder:
     ) -> tuple[IntArray, FloatArray, BoolArray]:
         """Solve the pose with each candidate: the likeliest, the odds of the others, whether the list was complete."""
         norm = found.squared_norm[chosen]
-        n = norm.shape[1]
-        trial = self.solve(
-            mirrors,
-            [r[mirrors][:, None] for r in self.resolved[:k]] + [found.range_m[chosen]],
-            np.repeat(poses.pivot_enu_m[mirrors], n, axis=0),
-            np.repeat(poses.rot_enu_from_mirror[mirrors], n, axis=0),
-        )
-        solved = (trial.status == RigidStatus.OK).reshape(norm.shape) | ~np.isfinite(norm)
+        trial = self.solve(mirrors, [r[mirrors][:, None] for r in self.resolved[:k]] + [found.range_m[chosen]], poses)
+        solved = (trial.status == PoseStatus.OK).reshape(norm.shape) | ~np.isfinite(norm)
         chi2 = np.where(np.isfinite(norm) & solved, trial.chi2.reshape(norm.shape), np.inf)
         best = np.argmin(chi2, axis=1)
         lowest = chi2.min(axis=1, keepdims=True)
@@ -419,16 +324,7 @@ def _is_unlikely(poses: RigidPoses) -> BoolArray:
     """Not solved, or with residuals that noise hardly makes."""
     with np.errstate(invalid="ignore"):
         rare = chdtrc(np.maximum(poses.dof, 1.0), poses.chi2) < _UNLIKELY
-    return np.asarray(rare | (poses.status == RigidStatus.NOT_CONVERGED))
-
-
-def _or(first: FloatArray, second: npt.ArrayLike) -> FloatArray:
-    return np.where(np.isfinite(first), first, np.asarray(second, np.float64))
-
-
-def _rows_of(pivot: FloatArray, rows: IntArray) -> FloatArray:
-    """Rows of surveyed pivots, one for all or one a mirror."""
-    return pivot if pivot.ndim == 1 or len(pivot) == 1 else pivot[rows]
+    return np.asarray(rare | (poses.status == PoseStatus.NOT_CONVERGED))
 
 
 def _round(observation: Observation, prediction: Prediction, known: Knowledge) -> tuple[FloatArray, FloatArray]:

@@ -9,16 +9,14 @@ from light (a camera, a calorimeter, the tracking calibration), once a mirror.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from rfpose.checks import FloatArray, as_float_array, read_only
+from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.arrays import bias_information, clock_ties, spread_places, start_clock, weights
-from rfpose.multilat.rigid.knowledge import Knowledge
+from rfpose.multilat.rigid.problem import MirrorProblem, start_clock
 
 __all__ = ["ReceiverPlaces", "places_bound", "refine_places"]
 
@@ -76,44 +74,22 @@ class ReceiverPlaces:
         return np.sqrt(np.diag(self.cov_m2)).reshape(-1, 3)
 
 
-def refine_places(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    range_m: npt.ArrayLike,
-    *,
-    sigma_m: npt.ArrayLike,
-    transmitter_sigma_m: npt.ArrayLike,
-    clock_class: npt.ArrayLike,
-    pivot_enu_m: npt.ArrayLike,
-    rot_enu_from_mirror: npt.ArrayLike,
-    common_pivot: bool = True,
-    knowledge: Knowledge | None = None,
-) -> ReceiverPlaces:
+def refine_places(problem: MirrorProblem, *, common_pivot: bool = True) -> ReceiverPlaces:
     """Refine one mirror's receiver places with its poses, from ranges in many postures.
 
     Parameters
     ----------
-    transmitter_enu_m : (transmitter, xyz)
-        [m].
-    receiver_mirror_m : (receiver, xyz)
-        As drawn, from the pivot, in the mirror frame [m].
-    range_m : (posture, group, receiver, transmitter)
-        Range plus clock, integers resolved [m]; NaN = not received. A posture is a frame.
-    sigma_m, transmitter_sigma_m, clock_class
-        As in `solve_rigid`, postures in place of mirrors.
-    pivot_enu_m, rot_enu_from_mirror : (posture, xyz), (posture, 3, 3)
-        Where to begin: `solve_rigid`'s poses with the places as drawn.
+    problem
+        Postures (frames) in place of mirrors, whole wavelengths resolved; the first posture's places count as drawn,
+        and it begins at `solve_rigid`'s poses with these.
     common_pivot
         The pivot is the same in all postures; else each posture has its own, and only the receivers' shape is seen.
-    knowledge
-        For clocks, mount, and the surveyed common pivot: its first row counts.
+        Of surveyed pivots the first counts.
 
     Raises
     ------
     InvalidInputError
-        Shapes that do not fit; no posture.
-    GeometryError
-        Receivers on a line.
+        No posture; a posture without a pose to begin with.
 
     Notes
     -----
@@ -121,129 +97,72 @@ def refine_places(
     shows stay zero (the step of least length). Without calibrated transmitters the pivot is known only as well as it is
     surveyed, and with it where the receivers are about it; the distances between receivers are not concerned.
     """
-    z = as_float_array("range_m", range_m, ("posture", "group", "receiver", "transmitter"), finite=False)
-    if not len(z):
-        raise InvalidInputError("`range_m` must hold at least one posture")
-    problem = _Problem(
-        transmitter_enu_m, receiver_mirror_m, z, sigma_m, transmitter_sigma_m, clock_class, knowledge, common_pivot
-    )
-    state = _State.begin(problem, z, pivot_enu_m, rot_enu_from_mirror)
+    state = _State.begin(problem, common_pivot)
     converged = False
     for _ in range(_MAX_ITERATION):
-        moved = state.step(problem, z)
+        moved = state.step()
         if moved < _CONVERGED_M:
             converged = True
             break
-    return state.result(problem, z, converged)
+    return state.result(converged)
 
 
-def places_bound(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    pivot_enu_m: npt.ArrayLike,
-    rot_enu_from_mirror: npt.ArrayLike,
-    *,
-    sigma_m: npt.ArrayLike,
-    transmitter_sigma_m: npt.ArrayLike,
-    clock_class: npt.ArrayLike,
-    common_pivot: bool = True,
-    knowledge: Knowledge | None = None,
-) -> ReceiverPlaces:
+def places_bound(problem: MirrorProblem, *, common_pivot: bool = True) -> ReceiverPlaces:
     """Return what planned postures would show of the receivers' places: the covariance, and what stays unseen.
 
     Parameters
     ----------
-    pivot_enu_m, rot_enu_from_mirror : (posture, xyz), (posture, 3, 3)
-        The postures.
-    sigma_m : (posture, group, receiver, transmitter)
-        NaN or infinity = not received [m].
-    transmitter_enu_m, receiver_mirror_m, transmitter_sigma_m, clock_class, common_pivot, knowledge
+    problem
+        The postures, by `MirrorProblem.expected`.
+    common_pivot
         As in `refine_places`.
     """
-    sigma = as_float_array("sigma_m", sigma_m, ("posture", "group", "receiver", "transmitter"), finite=False)
-    seen = np.isfinite(sigma)
-    given = np.where(seen, 0.0, np.nan)
-    problem = _Problem(
-        transmitter_enu_m,
-        receiver_mirror_m,
-        given,
-        np.where(seen, sigma, 1.0),
-        transmitter_sigma_m,
-        clock_class,
-        knowledge,
-        common_pivot,
-    )
-    state = _State.begin(problem, given, pivot_enu_m, rot_enu_from_mirror)
-    distance, _ = state.ranges(problem)
-    exact = np.where(seen, distance[:, None], np.nan)
+    state = _State.begin(problem, common_pivot)
+    distance, _ = state.ranges()
+    state.problem = replace(problem, range_m=np.where(np.isfinite(problem.range_m), distance[:, None], np.nan))
     state.clock[:] = 0.0
-    return state.result(problem, exact, True)
-
-
-class _Problem:
-    """What stays the same from step to step."""
-
-    def __init__(
-        self,
-        transmitter_enu_m: npt.ArrayLike,
-        receiver_mirror_m: npt.ArrayLike,
-        z: FloatArray,
-        sigma_m: npt.ArrayLike,
-        transmitter_sigma_m: npt.ArrayLike,
-        clock_class: npt.ArrayLike,
-        knowledge: Knowledge | None,
-        common_pivot: bool,
-    ) -> None:
-        n_posture, n_group, n_receiver, n_transmitter = z.shape
-        self.transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, (n_transmitter, 3))
-        self.nominal = spread_places(
-            as_float_array("receiver_mirror_m", receiver_mirror_m, (n_receiver, 3)), 1, n_receiver
-        )[0]
-        self.weight = weights(z, sigma_m)
-        self.bias_info = bias_information(transmitter_sigma_m, (n_posture, n_group, n_transmitter))
-        self.classes = np.asarray(clock_class, np.int64)
-        self.n_class = int(self.classes.max()) + 1
-        self.known = knowledge or Knowledge()
-        self.own, self.tie = clock_ties(
-            self.known.clock_sigma_m, self.weight, self.bias_info, self.classes, self.n_class
-        )
-        self.common_pivot = common_pivot
-        self.n_receiver, self.n_posture = n_receiver, n_posture
+    return state.result(True)
 
 
 @dataclass(kw_only=True)
 class _State:
     """Places, poses and clocks as they are now."""
 
+    problem: MirrorProblem
+    common_pivot: bool
     places: FloatArray
     pivot: FloatArray
     rot: FloatArray
     clock: FloatArray
 
     @classmethod
-    def begin(cls, p: _Problem, z: FloatArray, pivot_enu_m: npt.ArrayLike, rot: npt.ArrayLike) -> _State:
-        pivot = np.array(as_float_array("pivot_enu_m", pivot_enu_m, (p.n_posture, 3)))
-        turn = np.array(as_float_array("rot_enu_from_mirror", rot, (p.n_posture, 3, 3)))
-        if p.common_pivot:
+    def begin(cls, problem: MirrorProblem, common_pivot: bool) -> _State:
+        if not len(problem.range_m):
+            raise InvalidInputError("`range_m` must hold at least one posture")
+        if not problem.has_start.all():
+            raise InvalidInputError("every posture must have a pose to begin with")
+        pivot, rot = problem.start_pivot_enu_m.copy(), problem.start_rot_enu_from_mirror.copy()
+        if common_pivot:
             pivot[:] = pivot.mean(axis=0)
-        places = np.array(p.nominal)
-        many = np.broadcast_to(places, (p.n_posture, *places.shape))
-        clock = start_clock(p.transmitter, many, pivot, turn, z, p.classes, p.n_class)
-        return cls(places=places, pivot=pivot, rot=turn, clock=clock)
+        clock = start_clock(problem, pivot, rot)
+        places = problem.receiver_mirror_m[0].copy()
+        return cls(problem=problem, common_pivot=common_pivot, places=places, pivot=pivot, rot=rot, clock=clock)
 
-    def ranges(self, p: _Problem) -> tuple[FloatArray, FloatArray]:
+    def ranges(self) -> tuple[FloatArray, FloatArray]:
         """Distances (posture, receiver, transmitter) and unit vectors from the transmitters."""
         arm = np.einsum("fab,rb->fra", self.rot, self.places)
-        away = (self.pivot[:, None] + arm)[:, :, None] - p.transmitter
+        away = (self.pivot[:, None] + arm)[:, :, None] - self.problem.transmitter_enu_m
         distance = np.linalg.norm(away, axis=-1)
         return distance, away / distance[..., None]
 
-    def equations(self, p: _Problem, z: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    def equations(self) -> tuple[FloatArray, FloatArray, float]:
         """Return the normal equations of each posture: [pivot, rotation, clocks, places], and chi²."""
+        p = self.problem.equations
+        classes = self.problem.clock_class
         n_f, n_g, n_r, n_t = p.weight.shape
-        n_clock = p.n_class * n_r
+        n_clock = self.problem.n_class * n_r
         n = 6 + n_clock + 3 * n_r
-        distance, unit = self.ranges(p)
+        distance, unit = self.ranges()
         arm = np.einsum("fab,rb->fra", self.rot, self.places)
         jacobian = np.zeros((n_f, n_g, n_r, n_t, n))
         jacobian[..., :3] = unit[:, None]
@@ -251,9 +170,10 @@ class _State:
         turned = np.einsum("frta,fab->frtb", unit, self.rot)
         for r in range(n_r):
             for g in range(n_g):
-                jacobian[:, g, r, :, 6 + p.classes[g] * n_r + r] = 1.0
+                jacobian[:, g, r, :, 6 + classes[g] * n_r + r] = 1.0
             jacobian[:, :, r, :, 6 + n_clock + 3 * r : 9 + n_clock + 3 * r] = turned[:, None, r]
-        left = np.where(p.weight > 0.0, z - distance[:, None] - self.clock[:, p.classes][..., None], 0.0)
+        z = self.problem.range_m
+        left = np.where(p.weight > 0.0, z - distance[:, None] - self.clock[:, classes][..., None], 0.0)
         # the transmitters' own errors: a weighted mean over receivers comes off
         total = p.weight.sum(axis=2) + p.bias_info
         scale = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), 0.0)
@@ -266,18 +186,18 @@ class _State:
         gradient = np.einsum("fgrtn,fgrt->fn", weighted, free)
         with np.errstate(invalid="ignore"):
             chi2 = float(np.sum(p.weight * free**2) + np.nansum(np.where(bias == 0.0, 0.0, p.bias_info) * bias**2))
-        self._add_priors(p, info, gradient)
+        self._add_priors(info, gradient)
         return info, gradient, chi2
 
-    def _add_priors(self, p: _Problem, info: FloatArray, gradient: FloatArray) -> None:
-        n_r = p.n_receiver
-        for k in range(p.n_class):
+    def _add_priors(self, info: FloatArray, gradient: FloatArray) -> None:
+        p, n_r = self.problem.equations, len(self.places)
+        for k in range(self.problem.n_class):
             for a in range(n_r):
                 i = 6 + k * n_r + a
                 # a clock that is held stays where it is: no gradient
-                info[:, i, i] += p.own[:, k, a]
+                info[:, i, i] += p.clock_own[:, k, a]
                 for b in range(a):
-                    j, w = 6 + k * n_r + b, p.tie[:, k, a, b]
+                    j, w = 6 + k * n_r + b, p.clock_tie[:, k, a, b]
                     apart = self.clock[:, k, b] - self.clock[:, k, a]
                     info[:, i, i] += w
                     info[:, j, j] += w
@@ -285,19 +205,17 @@ class _State:
                     info[:, j, i] -= w
                     gradient[:, i] += w * apart
                     gradient[:, j] -= w * apart
-        if p.known.two_axis:
-            slope = np.stack([self.rot[:, 1, 0], -self.rot[:, 0, 0]], axis=1)
-            level = p.known.roll_sigma_rad**-2
-            info[:, 3:5, 3:5] += level * slope[:, :, None] * slope[:, None]
-            gradient[:, 3:5] += level * slope * -self.rot[:, 2, :1]
+        slope = np.stack([self.rot[:, 1, 0], -self.rot[:, 0, 0]], axis=1)
+        info[:, 3:5, 3:5] += p.roll_info * slope[:, :, None] * slope[:, None]
+        gradient[:, 3:5] += p.roll_info * slope * -self.rot[:, 2, :1]
 
-    def reduced(self, p: _Problem, z: FloatArray) -> tuple[FloatArray, FloatArray, list[FloatArray], float]:
+    def reduced(self) -> tuple[FloatArray, FloatArray, list[FloatArray], float]:
         """Information and gradient of [places, common pivot], all else eliminated; and what leads back."""
-        info, gradient, chi2 = self.equations(p, z)
-        n_place = 3 * p.n_receiver
+        info, gradient, chi2 = self.equations()
+        n_place = self.places.size
         whole = info.shape[1]
         shared = np.arange(whole - n_place, whole)
-        if p.common_pivot:
+        if self.common_pivot:
             shared = np.concatenate([shared, np.arange(3)])
         own = np.setdiff1d(np.arange(whole), shared)
         a_oo, a_os = info[:, own[:, None], own], info[:, own[:, None], shared]
@@ -305,37 +223,36 @@ class _State:
         back, rest = solved[..., :-1], solved[..., -1]
         s = (info[:, shared[:, None], shared] - a_os.swapaxes(1, 2) @ back).sum(axis=0)
         g = (gradient[:, shared] - np.einsum("fos,fo->fs", a_os, rest)).sum(axis=0)
-        if p.common_pivot and p.known.pivot_enu_m is not None and np.isfinite(p.known.pivot_sigma_m):
-            w, away = p.known.pivot_sigma_m**-2, np.ravel(p.known.pivot_enu_m)[:3] - self.pivot[0]
-            s[n_place:, n_place:] += w * np.eye(3)
-            g[n_place:] += w * away
-            chi2 += float(w * away @ away)
+        if self.common_pivot:
+            prior, away = self.problem.equations.pivot_info[0], self.problem.equations.pivot[0] - self.pivot[0]
+            s[n_place:, n_place:] += prior
+            g[n_place:] += prior @ away
+            chi2 += float(away @ prior @ away)
         return s, g, [back, rest, own, shared], chi2
 
-    def step(self, p: _Problem, z: FloatArray) -> float:
+    def step(self) -> float:
         """Move everything by one Gauss-Newton step; return how far the places went [m]."""
-        s, g, (back, rest, own, shared), _ = self.reduced(p, z)
+        s, g, (back, rest, own, shared), _ = self.reduced()
         value, vector = np.linalg.eigh(s)
         seen = value > _UNSEEN * value[-1]
         move = vector[:, seen] @ ((vector[:, seen].T @ g) / value[seen])
-        step = np.zeros((p.n_posture, len(own) + len(shared)))
+        step = np.zeros((len(self.pivot), len(own) + len(shared)))
         step[:, shared.astype(int)] = move
         step[:, own.astype(int)] = rest - back @ move
         self.pivot += step[:, :3]
-        for f in range(p.n_posture):
+        for f in range(len(self.pivot)):
             before = self.rot[f].copy()
             _kernels.rotate(step[f, 3:6], before, self.rot[f])
-        n_clock = p.n_class * p.n_receiver
-        self.clock += step[:, 6 : 6 + n_clock].reshape(self.clock.shape)
-        n_place = 3 * p.n_receiver
+        self.clock += step[:, 6 : 6 + self.clock[0].size].reshape(self.clock.shape)
+        n_place = self.places.size
         self.places += move[:n_place].reshape(-1, 3)
         return float(np.max(np.abs(move[:n_place])))
 
-    def result(self, p: _Problem, z: FloatArray, converged: bool) -> ReceiverPlaces:
+    def result(self, converged: bool) -> ReceiverPlaces:
         """All that is known at the end."""
-        s, _, _, chi2 = self.reduced(p, z)
-        n_place = 3 * p.n_receiver
-        if p.common_pivot:
+        s, _, _, chi2 = self.reduced()
+        n_place = self.places.size
+        if self.common_pivot:
             # the pivot's own place is eliminated as well
             s = (
                 s[:n_place, :n_place]
@@ -344,15 +261,11 @@ class _State:
         value, vector = np.linalg.eigh(0.5 * (s + s.T))
         seen = value > _UNSEEN * value[-1]
         unseen = vector[:, ~seen].T
-        pose = 3 * p.n_posture + (3 if p.common_pivot else 3 * p.n_posture)
-        used = p.weight > 0.0
-        bias = int((used.any(axis=2) & (p.bias_info == 0.0)).sum())
-        clocks = p.n_class * (p.n_receiver if not np.isfinite(p.known.clock_sigma_m) else 1)
-        calibrated = [bool(np.any(p.bias_info[:, p.classes == k] > 0.0)) for k in range(p.n_class)]
-        clocks -= sum(not c for c in calibrated)
-        dof = float(used.sum() - bias - pose - clocks * p.n_posture - int(seen.sum()))
-        dof += p.n_posture * float(p.known.two_axis)
-        dof += 3.0 * (p.common_pivot and p.known.pivot_enu_m is not None and np.isfinite(p.known.pivot_sigma_m))
+        # a posture's own unknowns are counted with it; what all share, here
+        n_posture, surveyed = len(self.pivot), 3 * self.problem.knowledge.has_pivot
+        dof = float(self.problem.equations.dof.sum() - surveyed * n_posture - int(seen.sum()))
+        if self.common_pivot:
+            dof += 3 * n_posture - 3 + surveyed
         names, modes = _name(unseen, self.places)
         return ReceiverPlaces(
             receiver_mirror_m=read_only(self.places),

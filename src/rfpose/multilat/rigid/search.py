@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.ambiguity import _kernels, integer_least_squares
-from rfpose.multilat.rigid.pose import Knowledge, RigidPoses
+from rfpose.multilat.rigid.pose import RigidPoses
+from rfpose.multilat.rigid.problem import Knowledge
 
 __all__ = ["Candidates", "Prediction", "can_search", "predict", "search_integers"]
 

@@ -8,13 +8,12 @@ import numpy as np
 
 from rfpose.dsp import Calibration, TonePhases
 from rfpose.multilat import RangeDifferences
+from rfpose.multilat.estimation import protected, without_vague
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.result import FixTable, PoseTable
-from rfpose.pipeline.rigid.direct import solve_direct
-from rfpose.pipeline.rigid.found import Stages, as_protected, without_vague
+from rfpose.pipeline.rigid.inputs import Stages, solve_group
 from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
-from rfpose.pipeline.rigid.two_ray import solve_two_ray
 from rfpose.scenario import Scenario
 
 __all__ = ["RigidOutcome", "solve_rigid_poses"]
@@ -54,11 +53,10 @@ def solve_rigid_poses(
     start = tones.frame_start_index
     time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
     for group in mirror_groups(scenario):
-        found = solve_two_ray(stages, group) if choice.reflection != "none" else solve_direct(stages, group)
         missed = scenario.integrity.missed_detection
-        found = without_vague(as_protected(found, missed))
+        found = without_vague(protected(solve_group(stages, group), missed))
         if group.learns_delays:
-            found = as_protected(tables.put_delays(group, found, time_s), missed)
+            found = protected(tables.put_delays(group, found, time_s), missed)
         tables.put(group, found)
         if choice.filtered:
             tables.put_filtered(group, found, time_s, exposure_s=float(scenario.radio.frame_samples / sample_rate))

@@ -1,77 +1,150 @@
-"""What the estimators begin with: ranges of one group of mirrors, and a start."""
+"""What the estimators begin with: the problem that one group of mirrors poses, made of the stages before."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.rigid import Knowledge
-from rfpose.multilat.rigid.integers import Observation, align_points
+from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp.calibration import frame_times, phase_average
+from rfpose.measurement import reflectors_of
+from rfpose.multilat import FixStatus, RangeDifferences
+from rfpose.multilat.estimation import Alarms, Found, Reflections, solve_direct, solve_two_ray
+from rfpose.multilat.rigid import MirrorProblem
+from rfpose.multilat.rigid.integers import align_points
 from rfpose.multilat.rigid.start import rotations_from_differences
-from rfpose.pipeline.mirrors import (
-    MirrorGroup,
-    observations,
-)
-from rfpose.pipeline.rigid.found import BoolArray, Stages
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, observations
+from rfpose.pipeline.result import FixTable
+from rfpose.scenario import Scenario
 
 _VAGUE_RATIO = 100.0
 """A calibration off by so many times what the pivot is off by tells nothing of the pose."""
 
 
-def inputs_of(stages: Stages, group: MirrorGroup) -> tuple[FloatArray, FloatArray, FloatArray, list[Observation]]:
-    """Places of receivers, poses to begin with (pivot, rotation), and phases as ranges."""
-    n_frame = len(stages.tones.frame_start_index)
-    places = np.tile(group.places_m, (n_frame, 1, 1))
-    located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
-    start, rot = align_points(places, located)
-    phases = observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group)
-    known = group.knowledge(n_frame)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stages:
+    """What the stages before found, and how to go on."""
+
+    tones: TonePhases
+    calibration: Calibration
+    ranges: RangeDifferences
+    fixes: FixTable
+    scenario: Scenario
+    choice: PoseChoice
+
+    @property
+    def n_frame(self) -> int:
+        """Frames."""
+        return len(self.tones.frame_start_index)
+
+    @property
+    def alarms(self) -> Alarms | None:
+        """When to leave something out; None: never."""
+        table = self.scenario.integrity
+        if not self.choice.integrity:
+            return None
+        return Alarms(
+            false_alarm=table.false_alarm,
+            missed_detection=table.missed_detection,
+            max_excluded=table.max_excluded,
+        )
+
+
+def solve_group(stages: Stages, group: MirrorGroup) -> Found:
+    """Solve one group of mirrors by the chosen estimator."""
+    problem = problem_of(stages, group)
     if stages.choice.reflection == "none":
-        phases = [_without_vague_calibration(o, known) for o in phases]
-    weak = np.flatnonzero(_are_vague(stages, group, places))
+        return solve_direct(problem, stages.alarms, _either_side(stages, group, problem))
+    scenario, tones = stages.scenario, stages.tones
+    row = np.arange(len(problem.range_m)).reshape(stages.n_frame, -1)
+    frame, heliostat = (index.ravel() for index in np.indices(row.shape))
+    average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
+    reflections = Reflections(
+        reflectors=reflectors_of(scenario, stages.choice.reflection),
+        carrier_rf_hz=scenario.carrier_rf_hz,
+        calibration=calibration_sight(average, scenario, frame),
+        free_space=scenario.reflection.spreading == "free_space",
+        propagation_speed_mps=scenario.radio.propagation_speed_mps,
+    )
+    return solve_two_ray(
+        problem,
+        reflections,
+        stages.alarms,
+        surveyed_enu_m=np.tile(group.pivot_enu_m, (stages.n_frame, 1)),
+        heliostat=heliostat,
+        shared={"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared],
+    )
+
+
+def problem_of(stages: Stages, group: MirrorGroup) -> MirrorProblem:
+    """Return the problem that a group's mirrors pose, one row a frame and heliostat."""
+    places = np.tile(group.places_m, (stages.n_frame, 1, 1))
+    pivot, rot = align_points(places, _located(stages, group))
+    problem = MirrorProblem.of_observations(
+        stages.scenario.transmitter_enu_m,
+        places,
+        observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group),
+        start_pivot_enu_m=pivot,
+        start_rot_enu_from_mirror=rot,
+        knowledge=group.knowledge(stages.n_frame),
+    )
+    if stages.choice.reflection == "none":
+        problem = _without_vague_calibration(problem)
+    known, weak = problem.knowledge, np.flatnonzero(_are_vague(stages, group, places))
     if known.pivot_enu_m is not None and weak.size:
-        start[weak] = known.pivot_enu_m[weak]
+        pivot[weak] = known.pivot_enu_m[weak]
         rot[weak] = rotations_from_differences(
-            stages.scenario.transmitter_enu_m,
+            problem.transmitter_enu_m,
             places[weak],
-            start[weak],
-            phases[0].range_m[weak],
-            sigma_m=phases[0].sigma_m[weak],
+            pivot[weak],
+            problem.range_m[weak, 0],
+            sigma_m=problem.sigma_m[weak, 0],
             clock_sigma_m=known.clock_sigma_m,
         )
-    return places, start, rot, phases
+    return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
 
-def either_side(stages: Stages, group: MirrorGroup) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Poses to begin with (pivot, rotation), all receivers below the transmitters' plane, then all above it."""
-    middle = stages.scenario.transmitter_enu_m.mean(axis=0)
-    up = np.linalg.svd(stages.scenario.transmitter_enu_m - middle)[2][-1]
+def _located(stages: Stages, group: MirrorGroup) -> FloatArray:
+    """(mirror, receiver, xyz) where each receiver was located by itself [m]."""
+    return group.of_mirrors(stages.fixes.position_enu_m)
+
+
+def _either_side(
+    stages: Stages, group: MirrorGroup, problem: MirrorProblem
+) -> Iterator[tuple[np.ndarray[tuple[int], np.dtype[np.int64]], MirrorProblem]]:
+    """Mirrors with a fix that may be on either side of the transmitters' plane: all below it, then all above it."""
+    rows = np.flatnonzero((group.of_mirrors(stages.fixes.status) == FixStatus.AMBIGUOUS).any(axis=1))
+    if not rows.size:
+        return
+    middle = problem.transmitter_enu_m.mean(axis=0)
+    up = np.linalg.svd(problem.transmitter_enu_m - middle)[2][-1]
     up = up if up[2] >= 0.0 else -up
-    places = np.tile(group.places_m, (len(stages.tones.frame_start_index), 1, 1))
-    located = stages.fixes.position_enu_m[:, group.rows].reshape(len(places), -1, 3)
+    located = _located(stages, group)
     height = ((located - middle) @ up)[..., None]
     for sign in (-1.0, 1.0):
-        yield align_points(places, located + (sign * np.abs(height) - height) * up)
+        pivot, rot = align_points(problem.receiver_mirror_m, located + (sign * np.abs(height) - height) * up)
+        yield rows, replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot).take(rows)
 
 
-def _without_vague_calibration(phases: Observation, known: Knowledge) -> Observation:
+def _without_vague_calibration(problem: MirrorProblem) -> MirrorProblem:
     """Leave an old calibration out where the pivot is known far better than it could tell: differences remain.
 
     What it adds is next to nothing, and so little that the clocks' equations would be singular to working precision.
     """
-    common = phases.transmitter_sigma_m
-    vague = common > _VAGUE_RATIO * known.pivot_sigma_m
-    return replace(phases, transmitter_sigma_m=np.where(vague, np.inf, common))
+    common = problem.transmitter_sigma_m
+    vague = common > _VAGUE_RATIO * problem.knowledge.pivot_sigma_m
+    return replace(problem, transmitter_sigma_m=np.where(vague, np.inf, common))
 
 
-def _are_vague(stages: Stages, group: MirrorGroup, places: FloatArray) -> BoolArray:
+def _are_vague(stages: Stages, group: MirrorGroup, places: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """(mirror,) whether a receiver's fix, if there is one, is less certain than the mirror is wide.
 
     So it is without calibration receivers, or with a calibration that is old.
     """
-    variance = np.trace(stages.fixes.cov_enu_m2[:, group.rows], axis1=-2, axis2=-1).reshape(places.shape[:2])
+    variance = np.trace(group.of_mirrors(stages.fixes.cov_enu_m2), axis1=-2, axis2=-1)
     width = np.linalg.norm(places - places.mean(axis=1, keepdims=True), axis=-1).max(axis=1)
     return np.asarray(~(np.sqrt(variance) < width[:, None]).all(axis=1))

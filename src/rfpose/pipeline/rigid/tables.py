@@ -11,22 +11,20 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.geometry import azimuth_elevation_from_enu
 from rfpose.multilat import Motion, PoseStatus, TrackStatus, track_poses
+from rfpose.multilat.estimation import Found
 from rfpose.multilat.integrity import IntegrityStatus
-from rfpose.multilat.rigid import full_covariance
+from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
-from rfpose.multilat.rigid.integers import IntegerMethod, Observation
+from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
     mirror_groups,
 )
 from rfpose.pipeline.result import DelayTable, FilteredTable, IntegrityTable, PoseTable, ReflectionTable
-from rfpose.pipeline.rigid.found import (
-    BoolArray,
-    Found,
-    IntArray,
-    Stages,
-)
-from rfpose.scenario import Scenario
+from rfpose.pipeline.rigid.inputs import Stages
+
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,13 +191,13 @@ class Tables:
         scenario = self._stages.scenario
         speed = scenario.radio.propagation_speed_mps
         n_frame, n_helio = self._n_frame, len(group.column)
-        poses, whole = found.poses, _with_clocks(scenario, group, found, n_frame)
+        poses, whole = found.poses, _with_clocks(found)
         # poses that are doubted, or rest on fewer priors than the rest, teach nothing
         whole[found.status != PoseStatus.OK] = np.nan
         if found.guard is not None:
             whole[found.guard.prior_rejected.any(axis=1)] = np.nan
         n_class = poses.clock_m.shape[1]
-        observed = _observed_clocks(found.ranges, n_class)
+        observed = _observed_clocks(found.problem, n_class)
 
         def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
             return array.reshape(n_frame, n_helio, *array.shape[1:])
@@ -245,30 +243,25 @@ class Tables:
         )
 
 
-def _with_clocks(scenario: Scenario, group: MirrorGroup, found: Found, n_frame: int) -> FloatArray:
+def _with_clocks(found: Found) -> FloatArray:
     """Covariance of pose and clocks of every mirror."""
     if found.full_cov is not None:
         return np.array(found.full_cov)
-    phases = found.ranges
-    return np.array(
-        full_covariance(
-            scenario.transmitter_enu_m,
-            np.tile(group.places_m, (n_frame, 1, 1)),
-            np.nan_to_num(found.poses.pivot_enu_m),
-            np.nan_to_num(found.poses.rot_enu_from_mirror),
-            sigma_m=np.stack([np.where(np.isfinite(o.range_m), o.sigma_m, np.nan) for o in phases], axis=1),
-            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in phases], axis=1),
-            clock_class=[o.clock_class for o in phases],
-            knowledge=found.known,
-        )
+    poses = found.poses
+    ended = replace(
+        found.problem,
+        start_pivot_enu_m=np.nan_to_num(poses.pivot_enu_m),
+        start_rot_enu_from_mirror=np.nan_to_num(poses.rot_enu_from_mirror),
     )
+    return full_covariance(ended)
 
 
-def _observed_clocks(phases: list[Observation], n_class: int) -> BoolArray:
+def _observed_clocks(problem: MirrorProblem, n_class: int) -> BoolArray:
     """(mirror, class, receiver) whether any range tells of a clock."""
-    out = np.zeros((len(phases[0].range_m), n_class, phases[0].range_m.shape[1]), np.bool_)
-    for phase in phases:
-        out[:, phase.clock_class] |= np.isfinite(phase.range_m).any(axis=2)
+    seen: BoolArray = np.asarray(np.isfinite(problem.range_m).any(axis=3))
+    out = np.zeros((len(seen), n_class, seen.shape[2]), np.bool_)
+    for k, clock in enumerate(problem.clock_class):
+        out[:, clock] |= seen[:, k]
     return out
 
 

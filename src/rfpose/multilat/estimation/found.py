@@ -1,4 +1,4 @@
-"""What the stages before found, what an estimator finds of one group of mirrors, and small things both need."""
+"""What an estimator finds of mirrors, and what all estimators do with it."""
 
 from __future__ import annotations
 
@@ -10,55 +10,71 @@ import numpy.typing as npt
 from scipy.special import chdtrc
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.dsp import Calibration, TonePhases
-from rfpose.multilat import PoseStatus, RangeDifferences
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import widened
 from rfpose.multilat.normal import MAX_SIGMA_RAD
-from rfpose.multilat.rigid import Knowledge, RigidPoses, RigidStatus
-from rfpose.multilat.rigid.integers import Observation
-from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.result import FixTable
-from rfpose.scenario import Scenario
+from rfpose.multilat.rigid import MirrorProblem, RigidPoses
+from rfpose.multilat.status import PoseStatus
+
+__all__ = [
+    "RESIDUAL_PROBABILITY",
+    "Alarms",
+    "Found",
+    "are_doubted",
+    "joined",
+    "protected",
+    "put_rows",
+    "residual_probability",
+    "without_vague",
+]
 
 RESIDUAL_PROBABILITY = 1e-9
 """A pose whose residuals are rarer than this under the reported noise is marked."""
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-_STATUS = {
-    RigidStatus.OK: PoseStatus.OK,
-    RigidStatus.SINGULAR: PoseStatus.UNDETERMINED,
-    RigidStatus.NOT_CONVERGED: PoseStatus.NOT_CONVERGED,
-    RigidStatus.NO_START: PoseStatus.TOO_FEW,
-    RigidStatus.TOO_FEW: PoseStatus.UNKNOWNS,
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stages:
-    """What the stages before found, and how to go on."""
+class Alarms:
+    """When tests of residuals speak up; as in `rfpose.multilat.integrity.solve_with_integrity`."""
 
-    tones: TonePhases
-    calibration: Calibration
-    ranges: RangeDifferences
-    fixes: FixTable
-    scenario: Scenario
-    choice: PoseChoice
+    false_alarm: float
+    missed_detection: float
+    max_excluded: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Found:
-    """Poses of one group; first axis frame × heliostat. ``status`` is `PoseStatus`."""
+    """Poses of mirrors, and how they came about; None where an estimator does not look for it.
+
+    Attributes
+    ----------
+    poses
+    status : (mirror,)
+        `PoseStatus`.
+    fixed, wrong_risk, method : (mirror, group)
+        As in `rfpose.multilat.rigid.integers.RigidSolution`.
+    problem
+        As solved in the end: integers resolved, NaN where left out.
+    full_cov : (mirror, unknown, unknown)
+        Of pose and clocks, where it is more than that of ``problem`` alone.
+    guard
+        The tests.
+    probability_all : (mirror,)
+        Probability of the residuals with nothing left out.
+    coefficient, coefficient_sigma : (mirror, reflector), (mirror, reflector, 2)
+        Of what reflects.
+    probability_direct : (mirror,)
+        Of the residuals with the direct ray alone.
+    """
 
     poses: RigidPoses
     status: IntArray
     fixed: BoolArray
     wrong_risk: FloatArray
     method: IntArray
-    ranges: list[Observation]
-    """As used: integers resolved, NaN where left out."""
-    known: Knowledge
+    problem: MirrorProblem
     full_cov: FloatArray | None = None
     guard: GuardedPoses | None = None
     probability_all: FloatArray | None = None
@@ -67,18 +83,13 @@ class Found:
     probability_direct: FloatArray | None = None
 
 
-def pose_status(status: IntArray) -> IntArray:
-    """Return `PoseStatus` of `RigidStatus`."""
-    return np.array([_STATUS[RigidStatus(s)] for s in status], np.int64)
-
-
 def residual_probability(poses: RigidPoses) -> FloatArray:
     """Return the probability of residuals as large as these or larger."""
     with np.errstate(invalid="ignore"):
         return np.asarray(chdtrc(np.maximum(poses.dof, 1.0), poses.chi2))
 
 
-def as_protected(found: Found, missed: float) -> Found:
+def protected(found: Found, missed: float) -> Found:
     """Let covariances say what protection levels do, where something was left out; ``missed`` is theirs."""
     guard = found.guard
     if guard is None:
@@ -104,21 +115,6 @@ def are_doubted(guard: GuardedPoses) -> BoolArray:
     return np.asarray((guard.status == IntegrityStatus.UNEXPLAINED) | unconfirmed)
 
 
-def keep_where(phases: list[Observation], used: BoolArray) -> list[Observation]:
-    """Return the observations with NaN where they are not used."""
-    return [replace(o, range_m=np.where(used, o.range_m, np.nan)) for o in phases]
-
-
-def rows_of(phases: Observation, rows: IntArray) -> Observation:
-    """Return the observations of some mirrors."""
-    return replace(
-        phases,
-        range_m=phases.range_m[rows],
-        sigma_m=phases.sigma_m[rows],
-        transmitter_sigma_m=phases.transmitter_sigma_m[rows],
-    )
-
-
 def put_rows(first: Found, rows: IntArray, second: Found, those: IntArray) -> Found:
     """Return poses with some mirrors' replaced by those of another solution."""
     return cast("Found", _put(first, rows, second, those))
@@ -127,20 +123,14 @@ def put_rows(first: Found, rows: IntArray, second: Found, those: IntArray) -> Fo
 def _put(first: Any, rows: IntArray, second: Any, those: IntArray) -> Any:
     if first is None:
         return None
-    if isinstance(first, list):
-        return [_put(a, rows, b, those) for a, b in zip(first, second, strict=True)]
+    if isinstance(first, MirrorProblem):
+        return replace(first, range_m=_put(first.range_m, rows, second.range_m, those))
     if is_dataclass(first) and not isinstance(first, type):
-        by_mirror = [f.name for f in fields(first) if f.name not in ("known", "wavelength_m", "clock_class")]
-        values = {name: _put(getattr(first, name), rows, getattr(second, name), those) for name in by_mirror}
+        values = {f.name: _put(getattr(first, f.name), rows, getattr(second, f.name), those) for f in fields(first)}
         return replace(first, **values)
     out = np.array(first)
     out[rows] = second[those]
     return out
-
-
-def where_known(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the first where it is finite, else the second."""
-    return np.where(np.isfinite(first), first, second)
 
 
 def joined(first: GuardedPoses, second: GuardedPoses) -> GuardedPoses:

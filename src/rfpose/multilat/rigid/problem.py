@@ -1,0 +1,461 @@
+"""Mirrors to be solved: what is measured of them, what is known besides, and the equations' weights made of both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.checks import FloatArray, as_float_array
+from rfpose.errors import GeometryError, InvalidInputError
+
+__all__ = ["Equations", "Knowledge", "MirrorProblem", "Observation", "degrees_of_freedom", "start_clock"]
+
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knowledge:
+    """What is known about mirrors besides the phases.
+
+    Attributes
+    ----------
+    clock_sigma_m
+        Standard deviation of each receiver's delay about the mirror's common clock [m]: 0 means one shared clock
+        with known delays, infinity one unknown clock a receiver.
+    pivot_enu_m : (mirror, xyz) or None
+        Surveyed pivots [m].
+    pivot_sigma_m
+        Their standard deviation in each axis [m].
+    two_axis
+        The mirror stands on an azimuth-elevation mount: its x axis stays horizontal.
+    roll_sigma_rad
+        How well it does.
+    """
+
+    clock_sigma_m: float = np.inf
+    pivot_enu_m: FloatArray | None = None
+    pivot_sigma_m: float = np.inf
+    two_axis: bool = False
+    roll_sigma_rad: float = 1e-6
+
+    @property
+    def has_pivot(self) -> bool:
+        """Whether pivots are surveyed."""
+        return self.pivot_enu_m is not None and bool(np.isfinite(self.pivot_sigma_m))
+
+    def take(self, rows: IntArray) -> Knowledge:
+        """Select mirrors."""
+        return self if self.pivot_enu_m is None else replace(self, pivot_enu_m=self.pivot_enu_m[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """One wavelength's phases as ranges: a tone, or the carrier.
+
+    Attributes
+    ----------
+    range_m : (mirror, receiver, transmitter)
+        −λ/(2π) × phase, up to whole wavelengths [m]; NaN = not received.
+    sigma_m : (mirror, receiver, transmitter)
+        Own noise [m].
+    transmitter_sigma_m : (mirror, transmitter)
+        Error common to all receivers [m]; infinity where nothing calibrates it.
+    wavelength_m : (transmitter,)
+        [m].
+    clock_class
+        Which clocks it sees: those of one number are the same.
+    carrier
+        Whether it is the carrier's own phase.
+    """
+
+    range_m: FloatArray
+    sigma_m: FloatArray
+    transmitter_sigma_m: FloatArray
+    wavelength_m: FloatArray
+    clock_class: int
+    carrier: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class MirrorProblem:
+    """Mirrors to be solved; `of`, `of_observations` and `expected` make one and check it.
+
+    A group is one wavelength's phases: tones, coarsest first, then the carrier.
+
+    Attributes
+    ----------
+    transmitter_enu_m : (transmitter, xyz)
+        [m].
+    receiver_mirror_m : (mirror, receiver, xyz)
+        From the pivot, in the mirror frame [m].
+    range_m : (mirror, group, receiver, transmitter)
+        Range plus clock [m]; NaN = not received.
+    sigma_m : (mirror, group, receiver, transmitter)
+        Own noise of each [m]; NaN or infinity = not received.
+    transmitter_sigma_m : (mirror, group, transmitter)
+        Error common to all receivers: of the calibration; infinity without one [m].
+    clock_class : (group,)
+        Which clocks a group sees.
+    start_pivot_enu_m, start_rot_enu_from_mirror : (mirror, xyz), (mirror, 3, 3)
+        Where to begin; NaN: nowhere.
+    knowledge
+        Clocks, pivot and mount.
+    wavelength_m : (group, transmitter)
+        [m]; NaN where whole wavelengths are resolved already and nobody asks.
+    is_carrier : (group,)
+    """
+
+    transmitter_enu_m: FloatArray
+    receiver_mirror_m: FloatArray
+    range_m: FloatArray
+    sigma_m: FloatArray
+    transmitter_sigma_m: FloatArray
+    clock_class: IntArray
+    start_pivot_enu_m: FloatArray
+    start_rot_enu_from_mirror: FloatArray
+    knowledge: Knowledge
+    wavelength_m: FloatArray
+    is_carrier: BoolArray
+
+    @classmethod
+    def of(
+        cls,
+        transmitter_enu_m: npt.ArrayLike,
+        receiver_mirror_m: npt.ArrayLike,
+        range_m: npt.ArrayLike,
+        *,
+        sigma_m: npt.ArrayLike,
+        transmitter_sigma_m: npt.ArrayLike,
+        clock_class: npt.ArrayLike,
+        start_pivot_enu_m: npt.ArrayLike,
+        start_rot_enu_from_mirror: npt.ArrayLike,
+        knowledge: Knowledge | None = None,
+    ) -> MirrorProblem:
+        """Return mirrors whose whole wavelengths are resolved; arrays as the attributes, broadcast.
+
+        Raises
+        ------
+        InvalidInputError
+            Shapes that do not fit, a sigma that is not positive.
+        GeometryError
+            Receivers on a line.
+        """
+        transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
+        z = as_float_array("range_m", range_m, ("mirror", "group", "receiver", "transmitter"), finite=False)
+        n_mirror, n_group, n_receiver, n_transmitter = z.shape
+        if n_transmitter != len(transmitter):
+            raise InvalidInputError(
+                f"`range_m` has {n_transmitter} transmitters, `transmitter_enu_m` {len(transmitter)}"
+            )
+        sigma = np.broadcast_to(np.asarray(sigma_m, np.float64), z.shape)
+        if np.any(sigma <= 0.0):
+            raise InvalidInputError("`sigma_m` must be greater than zero")
+        known = knowledge or Knowledge()
+        if known.pivot_enu_m is not None:
+            known = replace(known, pivot_enu_m=_spread(known.pivot_enu_m, (n_mirror, 3)))
+        return cls(
+            transmitter_enu_m=transmitter,
+            receiver_mirror_m=_places(receiver_mirror_m, n_mirror, n_receiver),
+            range_m=z,
+            sigma_m=sigma,
+            transmitter_sigma_m=_spread(transmitter_sigma_m, (n_mirror, n_group, n_transmitter)),
+            clock_class=np.asarray(clock_class, np.int64),
+            start_pivot_enu_m=_spread(start_pivot_enu_m, (n_mirror, 3)),
+            start_rot_enu_from_mirror=_spread(start_rot_enu_from_mirror, (n_mirror, 3, 3)),
+            knowledge=known,
+            wavelength_m=np.full((n_group, n_transmitter), np.nan),
+            is_carrier=np.zeros(n_group, np.bool_),
+        )
+
+    @classmethod
+    def of_observations(
+        cls,
+        transmitter_enu_m: npt.ArrayLike,
+        receiver_mirror_m: npt.ArrayLike,
+        observations: Sequence[Observation],
+        *,
+        start_pivot_enu_m: npt.ArrayLike,
+        start_rot_enu_from_mirror: npt.ArrayLike,
+        knowledge: Knowledge | None = None,
+    ) -> MirrorProblem:
+        """Return mirrors whose finer wavelengths are to be resolved: tones, coarsest first, then the carrier.
+
+        Raises
+        ------
+        InvalidInputError, GeometryError
+            As `of`; no tone, or a tone after the carrier.
+        """
+        carrier = [o.carrier for o in observations]
+        if not observations or carrier[0] or carrier != sorted(carrier):
+            raise InvalidInputError("`observations` must hold at least one tone, and tones before the carrier")
+        shape = np.shape(observations[0].range_m)
+        n_transmitter = len(np.asarray(transmitter_enu_m))
+        for k, o in enumerate(observations):
+            if np.ndim(o.range_m) != 3 or np.shape(o.range_m) != shape or shape[2] != n_transmitter:
+                raise InvalidInputError(
+                    f"`range_m` of observation {k} must have shape (mirror, receiver, {n_transmitter}) like the first, "
+                    f"got {np.shape(o.range_m)}"
+                )
+        problem = cls.of(
+            transmitter_enu_m,
+            receiver_mirror_m,
+            np.stack([o.range_m for o in observations], axis=1),
+            sigma_m=np.stack([np.broadcast_to(o.sigma_m, shape) for o in observations], axis=1),
+            transmitter_sigma_m=np.stack(
+                [np.broadcast_to(o.transmitter_sigma_m, (shape[0], shape[2])) for o in observations], axis=1
+            ),
+            clock_class=[o.clock_class for o in observations],
+            start_pivot_enu_m=start_pivot_enu_m,
+            start_rot_enu_from_mirror=start_rot_enu_from_mirror,
+            knowledge=knowledge,
+        )
+        waves = np.stack([np.broadcast_to(np.asarray(o.wavelength_m, np.float64), shape[2:]) for o in observations])
+        return replace(problem, wavelength_m=waves, is_carrier=np.array(carrier))
+
+    @classmethod
+    def expected(
+        cls,
+        transmitter_enu_m: npt.ArrayLike,
+        receiver_mirror_m: npt.ArrayLike,
+        pivot_enu_m: npt.ArrayLike,
+        rot_enu_from_mirror: npt.ArrayLike,
+        *,
+        sigma_m: npt.ArrayLike,
+        transmitter_sigma_m: npt.ArrayLike,
+        clock_class: npt.ArrayLike,
+        knowledge: Knowledge | None = None,
+    ) -> MirrorProblem:
+        """Return mirrors in known poses, of which nothing is measured yet: for bounds. Arrays as in `of`."""
+        sigma = as_float_array("sigma_m", sigma_m, ("mirror", "group", "receiver", "transmitter"), finite=False)
+        return cls.of(
+            transmitter_enu_m,
+            receiver_mirror_m,
+            np.where(np.isfinite(sigma), 0.0, np.nan),
+            sigma_m=sigma,
+            transmitter_sigma_m=transmitter_sigma_m,
+            clock_class=clock_class,
+            start_pivot_enu_m=pivot_enu_m,
+            start_rot_enu_from_mirror=rot_enu_from_mirror,
+            knowledge=knowledge,
+        )
+
+    @property
+    def n_tone(self) -> int:
+        """Groups that are tones."""
+        return int(np.count_nonzero(~self.is_carrier))
+
+    @property
+    def n_class(self) -> int:
+        """Clocks of each receiver."""
+        return int(self.clock_class.max()) + 1
+
+    def take(self, rows: IntArray) -> MirrorProblem:
+        """Select mirrors."""
+        return replace(
+            self,
+            receiver_mirror_m=self.receiver_mirror_m[rows],
+            range_m=self.range_m[rows],
+            sigma_m=self.sigma_m[rows],
+            transmitter_sigma_m=self.transmitter_sigma_m[rows],
+            start_pivot_enu_m=self.start_pivot_enu_m[rows],
+            start_rot_enu_from_mirror=self.start_rot_enu_from_mirror[rows],
+            knowledge=self.knowledge.take(rows),
+        )
+
+    def groups(self, which: slice) -> MirrorProblem:
+        """Select wavelengths."""
+        return replace(
+            self,
+            range_m=self.range_m[:, which],
+            sigma_m=self.sigma_m[:, which],
+            transmitter_sigma_m=self.transmitter_sigma_m[:, which],
+            clock_class=self.clock_class[which],
+            wavelength_m=self.wavelength_m[which],
+            is_carrier=self.is_carrier[which],
+        )
+
+    def observation(self, k: int) -> Observation:
+        """Return one wavelength's phases."""
+        return Observation(
+            range_m=self.range_m[:, k],
+            sigma_m=self.sigma_m[:, k],
+            transmitter_sigma_m=self.transmitter_sigma_m[:, k],
+            wavelength_m=self.wavelength_m[k],
+            clock_class=int(self.clock_class[k]),
+            carrier=bool(self.is_carrier[k]),
+        )
+
+    def started(self, pivot_enu_m: FloatArray, rot_enu_from_mirror: FloatArray) -> MirrorProblem:
+        """Return the mirrors beginning elsewhere; where that is nowhere, as before."""
+        rot = rot_enu_from_mirror
+        return replace(
+            self,
+            start_pivot_enu_m=np.where(np.isfinite(pivot_enu_m), pivot_enu_m, self.start_pivot_enu_m),
+            start_rot_enu_from_mirror=np.where(np.isfinite(rot), rot, self.start_rot_enu_from_mirror),
+        )
+
+    def only(self, used: BoolArray) -> MirrorProblem:
+        """Leave out what is not used (mirror, receiver, transmitter)."""
+        return replace(self, range_m=np.where(used[:, None], self.range_m, np.nan))
+
+    @property
+    def has_start(self) -> BoolArray:
+        """(mirror,) whether there is a pose to begin with."""
+        pivot, rot = self.start_pivot_enu_m, self.start_rot_enu_from_mirror
+        return np.asarray(np.isfinite(pivot).all(axis=1) & np.isfinite(rot).all(axis=(1, 2)))
+
+    @cached_property
+    def equations(self) -> Equations:
+        """What the solvers' equations weigh."""
+        return _equations(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Equations:
+    """Weights of measurements and priors, as kernels take them.
+
+    Attributes
+    ----------
+    weight : (mirror, group, receiver, transmitter)
+        1/σ² of each range, zero where it is not received.
+    bias_info : (mirror, group, transmitter)
+        1/σ² of what transmitters are off by: zero without calibration, infinite where exact.
+    pivot, pivot_info : (mirror, xyz), (mirror, 3, 3)
+        Surveyed pivots and their information, zero where unknown.
+    roll_info
+        Of the mount.
+    clock_own, clock_tie : (mirror, class, receiver), (mirror, class, receiver, receiver)
+        Information on each clock and on the differences between clocks.
+    dof : (mirror,)
+        Measurements and priors less unknowns.
+    """
+
+    weight: FloatArray
+    bias_info: FloatArray
+    pivot: FloatArray
+    pivot_info: FloatArray
+    roll_info: float
+    clock_own: FloatArray
+    clock_tie: FloatArray
+    dof: FloatArray
+
+
+def _equations(problem: MirrorProblem) -> Equations:
+    known, n_mirror = problem.knowledge, len(problem.range_m)
+    sigma, common = problem.sigma_m, problem.transmitter_sigma_m
+    seen = np.isfinite(problem.range_m) & np.isfinite(sigma)
+    weight = np.where(seen, 1.0 / np.where(seen, sigma, 1.0) ** 2, 0.0)
+    with np.errstate(divide="ignore"):
+        bias_info = np.array(np.where(np.isnan(common), 0.0, 1.0 / common**2))
+    pivot, pivot_info = np.zeros((n_mirror, 3)), np.zeros((n_mirror, 3, 3))
+    if known.pivot_enu_m is not None:
+        pivot = np.array(known.pivot_enu_m)
+        if known.has_pivot:
+            pivot_info[:] = np.eye(3) / known.pivot_sigma_m**2
+    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, problem.clock_class, problem.n_class)
+    return Equations(
+        weight=weight,
+        bias_info=bias_info,
+        pivot=pivot,
+        pivot_info=pivot_info,
+        roll_info=known.roll_sigma_rad**-2 if known.two_axis else 0.0,
+        clock_own=own,
+        clock_tie=tie,
+        dof=degrees_of_freedom(
+            weight,
+            bias_info,
+            problem.clock_class,
+            tied=np.full(n_mirror, np.isfinite(known.clock_sigma_m)),
+            n_prior=np.full(n_mirror, 3 * known.has_pivot + known.two_axis),
+        ),
+    )
+
+
+def degrees_of_freedom(
+    weight: FloatArray, bias_info: FloatArray, clock_class: IntArray, *, tied: BoolArray, n_prior: IntArray
+) -> FloatArray:
+    """Count measurements and priors less unknowns (mirror,).
+
+    Parameters
+    ----------
+    weight, bias_info, clock_class
+        As in `Equations` and `MirrorProblem`.
+    tied : (mirror,)
+        Whether a mirror's receivers have one clock.
+    n_prior : (mirror,)
+        What pivot and mount give.
+    """
+    seen = weight > 0.0
+    n = seen.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0 + n_prior
+    n -= (np.any(seen, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
+    for k in range(int(clock_class.max()) + 1):
+        clocks = np.any(seen[:, clock_class == k], axis=(1, 3)).sum(axis=1)
+        free = np.where(tied, np.minimum(clocks, 1), clocks)
+        # without calibration a common clock is the transmitters' as well, and counted with them
+        calibrated = np.any(bias_info[:, clock_class == k] > 0.0, axis=(1, 2))
+        n -= np.where(calibrated, free, np.maximum(free - 1, 0))
+    return np.asarray(n)
+
+
+def _places(receiver_mirror_m: npt.ArrayLike, n_mirror: int, n_receiver: int) -> FloatArray:
+    """Receivers in the mirror frame, one row a mirror; three or more, not on a line."""
+    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("...", n_receiver, 3))
+    for mirror in places.reshape(-1, n_receiver, 3)[:1]:
+        if n_receiver < 3 or geometry.is_collinear(mirror):
+            raise GeometryError("`receiver_mirror_m` must hold three or more receivers that are not on a line")
+    return np.array(np.broadcast_to(places, (n_mirror, n_receiver, 3)))
+
+
+def _spread(values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    return np.array(np.broadcast_to(np.asarray(values, np.float64), shape))
+
+
+def _clock_ties(
+    clock_sigma_m: float,
+    weight: FloatArray,
+    bias_info: FloatArray,
+    classes: npt.NDArray[np.int64],
+    n_class: int,
+) -> tuple[FloatArray, FloatArray]:
+    """Information on each clock and on the differences between clocks.
+
+    Clocks c + δ_r with δ_r of standard deviation s have differences of information 1/(R s²) a pair. Where no
+    transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says nothing.
+    """
+    n_mirror, _, n_receiver, _ = weight.shape
+    own = np.zeros((n_mirror, n_class, n_receiver))
+    tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
+    for k in range(n_class):
+        # each mirror's and class's own scale: no mirror's result depends on its neighbours, and the stiffest tie of a
+        # coarse tone stays comparable with what that tone observes
+        largest = np.maximum(weight[:, classes == k].max(axis=(1, 2, 3), initial=0.0), 1e-300)
+        known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
+        own[:, k, 0] = np.where(known, 0.0, largest)
+        # a clock that nothing observes is held as well; it takes part in nothing
+        seen = np.any(weight[:, classes == k] > 0.0, axis=(1, 3))
+        if np.isfinite(clock_sigma_m):
+            own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
+            tie[:, k] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None]
+        else:
+            own[:, k] = np.where(seen, own[:, k], largest[:, None])
+    return own, tie
+
+
+def start_clock(problem: MirrorProblem, pivot_enu_m: FloatArray, rot_enu_from_mirror: FloatArray) -> FloatArray:
+    """Clocks (mirror, class, receiver) that fit poses, one a mirror and class: the mean of range less distance."""
+    receiver = pivot_enu_m[:, None] + np.einsum("mab,mrb->mra", rot_enu_from_mirror, problem.receiver_mirror_m)
+    distance = np.linalg.norm(receiver[:, :, None] - problem.transmitter_enu_m, axis=-1)
+    out = np.zeros((len(receiver), problem.n_class, receiver.shape[1]))
+    for k in range(problem.n_class):
+        left = problem.range_m[:, problem.clock_class == k] - distance[:, None]
+        seen = np.isfinite(left)
+        count = seen.sum(axis=(1, 2, 3))
+        total = np.where(seen, left, 0.0).sum(axis=(1, 2, 3))
+        out[:, k] = np.where(count > 0, total / np.maximum(count, 1), 0.0)[:, None]
+    return out
