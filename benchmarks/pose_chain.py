@@ -10,7 +10,6 @@ samples times signal-to-noise ratio, all that the bound depends on, is that of 1
 from __future__ import annotations
 
 import argparse
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario, load_scenario
 
@@ -73,19 +72,16 @@ def site(rows: tuple[Any, ...], n_frame: int) -> Scenario:
     return Scenario.model_validate(data)
 
 
-def measure(rows: tuple[Any, ...], n_frame: int, directory: Path, *, seed: int = 7) -> dict[str, Evaluation]:
+def measure(rows: tuple[Any, ...], n_frame: int, *, seed: int = 7) -> dict[str, Evaluation]:
     """Simulate, process and evaluate; each form of the pose from the same phases."""
     scenario = site(rows, n_frame)
-    (directory / "site.toml").write_text(scenario.to_toml())
-    simulate_recording(directory / "site.toml", directory / "rec.h5", seed=seed, force=True)
-    result = process(directory / "rec.h5", directory / "r.h5", estimator="correlator", force=True)
+    result = process(simulate(scenario, seed=seed), estimator="correlator")
     out = {}
     for name, form in FORMS.items():
-        data = scenario.model_dump(exclude_none=True)
-        for heliostat in data["heliostat"]:
-            heliostat |= {k: v for k, v in form.items() if k != "pose"}
+        known = {k: v for k, v in form.items() if k != "pose"}
+        told = scenario.changed(heliostat=[h.model_dump(exclude_none=True) | known for h in scenario.heliostat])
         settings = {**result.settings, "pose": str(form["pose"])}
-        out[name] = evaluate(solve(result.tones, Scenario.model_validate(data), settings=settings, truth=result.truth))
+        out[name] = evaluate(solve(result.tones, told, settings=settings, truth=result.truth))
     return out
 
 
@@ -94,8 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=400)
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as directory:
-        found = measure(ROWS, args.frames, Path(directory))
+    found = measure(ROWS, args.frames)
     print("| mirror at, facing | " + " | ".join(f"{name}: error / bound" for name in found) + " |")
     print("|---" * (1 + len(found)) + "|")
     for k, (place, facing) in enumerate(ROWS):

@@ -8,14 +8,13 @@ one clock a mirror, calibration receivers as shipped. Ratios are rms error of so
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[1] / "data" / "table2_100m.toml"
@@ -53,11 +52,7 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for phase in PHASES_RAD:
         coefficient = complex(SIZE * np.exp(1j * phase))
-        with tempfile.TemporaryDirectory() as name:
-            directory = Path(name)
-            (directory / "site.toml").write_text(site(coefficient).to_toml())
-            simulate_recording(directory / "site.toml", directory / "rec.h5", seed=5)
-            result = process(directory / "rec.h5", directory / "r.h5", estimator="correlator", reflection="estimate")
+        result = process(simulate(site(coefficient), seed=5), estimator="correlator", reflection="estimate")
         evaluation = evaluate(result)
         reflection = result.reflection
         found = complex(np.nan) if reflection is None else complex(reflection.coefficient[0, 0, 0])

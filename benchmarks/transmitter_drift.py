@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from pose_chain import FRAME_SAMPLES, ROWS, site
 
 from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario
 
 CLOCKS = {"three clocks": {}, "one clock": {"receiver_delay_sigma_s": 0.0}}
@@ -28,43 +26,38 @@ N_CALIBRATED = 3
 
 def drifting(n_frame: int, drift_rad: float, *, stale: bool, mirror: dict[str, Any]) -> Scenario:
     """Return the site, its phases walking by ``drift_rad`` in the hour of the recording."""
-    data = site(ROWS, n_frame).model_dump(exclude_none=True)
-    data["heliostat"] = [{**h, "pivot_sigma_m": 0.005, **mirror} for h in data["heliostat"]]
-    data["simulation"] |= {
-        "frame_interval_s": 3600.0 / n_frame,
-        "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,
-    }
-    if stale:
-        data["simulation"]["dropped"] = [
-            {"receiver": c["id"], "frame": f, "first_sample": 0, "sample_count": FRAME_SAMPLES}
-            for c in data["calibration_receiver"]
-            for f in range(N_CALIBRATED, n_frame)
-        ]
-    return Scenario.model_validate(data)
+    base = site(ROWS, n_frame)
+    dropped = [
+        {"receiver": c.id, "frame": f, "first_sample": 0, "sample_count": FRAME_SAMPLES}
+        for c in base.calibration_receiver
+        for f in range(N_CALIBRATED, n_frame)
+    ]
+    return base.changed(
+        heliostat=[h.model_dump(exclude_none=True) | {"pivot_sigma_m": 0.005} | mirror for h in base.heliostat],
+        simulation={
+            "frame_interval_s": 3600.0 / n_frame,
+            "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,
+            "dropped": dropped if stale else None,
+        },
+    )
 
 
 def without_calibration(scenario: Scenario) -> Scenario:
     """Return the site without its calibration receivers."""
-    data = scenario.model_dump(exclude_none=True)
-    data["simulation"]["dropped"] = []
-    return Scenario.model_validate(data | {"calibration_receiver": []})
+    return scenario.changed(calibration_receiver=None, simulation={"dropped": None})
 
 
-def measure(
-    n_frame: int, drift_rad: float, directory: Path, *, mirror: dict[str, Any], seed: int = 7
-) -> dict[str, Evaluation]:
+def measure(n_frame: int, drift_rad: float, *, mirror: dict[str, Any], seed: int = 7) -> dict[str, Evaluation]:
     """Simulate, process and evaluate in each form."""
     out = {}
     for stale in (False, True):
         scenario = drifting(n_frame, drift_rad, stale=stale, mirror=mirror)
-        (directory / "site.toml").write_text(scenario.to_toml())
-        (directory / "bare.toml").write_text(without_calibration(scenario).to_toml())
-        simulate_recording(directory / "site.toml", directory / "rec.h5", seed=seed, force=True)
-        forms = {"three fits": {"pose": "independent"}, "rigid": {}}
+        recording = simulate(scenario, seed=seed)
+        forms: dict[str, dict[str, Any]] = {"three fits": {"pose": "independent"}, "rigid": {}}
         if not stale:
-            forms["differences"] = {"scenario_path": directory / "bare.toml"}
+            forms["differences"] = {"scenario": without_calibration(scenario)}
         for name, options in forms.items():
-            result = process(directory / "rec.h5", directory / "r.h5", estimator="correlator", force=True, **options)
+            result = process(recording, estimator="correlator", **options)
             out[f"{name}, stale" if stale else name] = evaluate(result)
     return out
 
@@ -79,8 +72,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|")
     for clocks, mirror in CLOCKS.items():
         for drift in (0.0, 0.1, 1.0):
-            with tempfile.TemporaryDirectory() as directory:
-                found = measure(n_frame, drift, Path(directory), mirror=mirror)
+            found = measure(n_frame, drift, mirror=mirror)
             for form, e in found.items():
                 print(
                     f"| {clocks} | {drift:g} | {form} | {e.normal_error_mrad.rms:.3f} | {e.sigma_mrad:.3f} "

@@ -8,17 +8,16 @@ tracking_events.png a day on which step counts, a cluster and power are lost, an
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+import rfpose as rf
+from rfpose.drawing import save_figure
 from rfpose.feedback.tracking import Simulation
-from rfpose.pipeline.track import TrackChanges, track
-from rfpose.pipeline.track_pictures import draw_track
-from rfpose.scenario import load_scenario
+from rfpose.pipeline.track import TrackChanges
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "data" / "tracking_100m.toml"
@@ -38,15 +37,15 @@ EVENTS = (
 
 def draw_outage(path: Path) -> None:
     """Draw the field's error through an outage."""
-    base = load_scenario(SCENARIO)
-    data = base.model_dump(exclude_none=True)
-    data["tracking"] |= {"first_hour": 9.5, "last_hour": 13.0}
-    data["tracking"]["radio"]["outages"] = ({"first_hour": OUTAGE[0], "last_hour": OUTAGE[1]},)
+    outage = {"first_hour": OUTAGE[0], "last_hour": OUTAGE[1]}
+    scenario = rf.load_scenario(SCENARIO).changed(
+        tracking={"first_hour": 9.5, "last_hour": 13.0, "radio": {"outages": [outage]}}
+    )
     methods = ("camera-model", "radio", "radio-model", "radio-both")
-    simulation = Simulation(type(base).model_validate(data), methods=methods, seed=0)
+    simulation = Simulation(scenario, methods=methods, seed=0)
     while simulation.done < simulation.n_segment:
         simulation.advance()
-    hour = simulation.days[0].hour[:: round(base.tracking.store_interval_s)]
+    hour = simulation.days[0].hour[:: round(scenario.tracking.store_interval_s)]
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -66,12 +65,9 @@ def main() -> None:
     """Draw all."""
     directory = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     directory.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as temporary:
-        found = track(SCENARIO, Path(temporary) / "day.h5")
-        methods = ("camera-model", "radio-both")
-        eventful = track(SCENARIO, Path(temporary) / "events.h5", methods=methods, changes=TrackChanges(events=EVENTS))
-    draw_track(found, directory / "tracking_day.png")
-    draw_track(eventful, directory / "tracking_events.png")
+    save_figure(rf.track(SCENARIO).plot(), directory / "tracking_day.png")
+    eventful = rf.track(SCENARIO, methods=("camera-model", "radio-both"), changes=TrackChanges(events=EVENTS))
+    save_figure(eventful.plot(), directory / "tracking_events.png")
     draw_outage(directory / "tracking_outage.png")
 
 

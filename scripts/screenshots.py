@@ -21,9 +21,9 @@ import numpy as np
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import TrackChanges, track
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from rfpose.viewer.export import open_window, png_of, settle
 from rfpose.viewer.views.live import LiveView
 from rfpose.viewer.views.tracking import TrackingView
@@ -43,31 +43,24 @@ EVENTS = (
 
 def site(folder: Path) -> Path:
     """Table 2's field with ten frames, a transmitter that two mirrors do not see, and a lost stretch."""
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    data["radio"]["frame_samples"] = 100_000
-    data["site"] |= {"latitude_deg": 37.1, "longitude_deg": -2.4}
-    data["simulation"] |= {
+    path = folder / "site.toml"
+    simulation = {
         "frame_count": 10,
         "tone_snr_db": 30.0,
         "blocked": [{"transmitter": "T4", "receivers": ["H05", "H09"]}],
         "dropped": [{"receiver": "H02_r0", "frame": 4, "first_sample": 500, "sample_count": 20_000}],
     }
-    path = folder / "site.toml"
-    path.write_text(Scenario.model_validate(data).to_toml())
+    load_scenario(shipped_scenario("table2_100m.toml")).changed(
+        radio={"frame_samples": 100_000}, site={"latitude_deg": 37.1, "longitude_deg": -2.4}, simulation=simulation
+    ).save(path)
     return path
 
 
 def large_site(folder: Path) -> Path:
     """Two thousand mirrors to lay transmitters out for."""
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    like = data["heliostat"][0]
-    places = radial_staggered(2000, first_radius_m=12.0, diagonal_m=3.4, height_m=2.0).tolist()
-    data["heliostat"] = [
-        like | {"id": f"H{k}", "pivot_enu_m": tuple(p), "receiver_ids": tuple(f"H{k}_r{i}" for i in range(3))}
-        for k, p in enumerate(places)
-    ]
     path = folder / "field.toml"
-    path.write_text(Scenario.model_validate(data).to_toml())
+    places = radial_staggered(2000, first_radius_m=12.0, diagonal_m=3.4, height_m=2.0)
+    load_scenario(shipped_scenario("table2_100m.toml")).with_field(places).save(path)
     return path
 
 
@@ -154,7 +147,7 @@ def main() -> None:
         folder = Path()
         scenario, recording, result, day = (Path(n) for n in ("site.toml", "recording.h5", "result.h5", "day.h5"))
         site(folder)
-        simulate_recording(scenario, recording, seed=1)
+        simulate(scenario, seed=1).save(recording)
         process(recording, result)
         track(shipped_scenario("tracking_100m.toml"), day, changes=TrackChanges(events=EVENTS))
         welcome(out / "viewer_welcome.png", scenario)

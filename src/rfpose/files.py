@@ -229,7 +229,7 @@ class Claim:
 
     def _refuse_existing(self, output: _Output) -> None:
         if output.real.exists() and not self._force and output.real not in self._own:
-            raise RecordingError(f"{output.path}: exists already; choose another name, or --force to overwrite it")
+            raise RecordingError(f"{output.path}: exists already; choose another name, or `force=True` to overwrite it")
 
     def _refuse_inputs(self, output: _Output) -> None:
         """Raise if an input would be replaced, whatever `force` says."""
@@ -322,15 +322,15 @@ def release_all() -> None:
         job.release()
 
 
-def write_atomically(path: str | Path, content: bytes) -> None:
-    """Make a file from bytes, in the running `claim` if that holds it, else at once.
+def write_atomically(path: str | Path, content: bytes, *, force: bool = True) -> None:
+    """Make a file from bytes, in the running `claim` if that holds it, else at once; ``force``: replace what exists.
 
     Raises
     ------
     RecordingError
         Writing failed (disk full, no permission); ``path`` is as it was and nothing is left beside it.
     """
-    with claim(path, force=True) as job:
+    with claim(path, force=force) as job:
         job.write(path, content)
 
 

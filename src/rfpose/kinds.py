@@ -21,9 +21,9 @@ _WORDS = {
     "recording": "a recording, which `rfpose process`, `rfpose convert`, `rfpose info` and `rfpose view` take",
     "result": "a result of `rfpose process`, which `rfpose evaluate`, `rfpose info` and `rfpose view` take",
     "track": "a run of `rfpose track`, which `rfpose info` and `rfpose view` take",
-    "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate --mount` and `rfpose info` take",
+    "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate` and `rfpose info` take",
     "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
-    "truth": "a truth, which `rfpose evaluate --truth` takes",
+    "truth": "a truth, which `rfpose evaluate` takes beside a result",
 }
 _MADE = {"result": ("result", "`rfpose process`"), "track": ("tracking run", "`rfpose track`")}
 _HDF5 = b"\x89HDF\r\n\x1a\n"

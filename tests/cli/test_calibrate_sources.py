@@ -25,7 +25,7 @@ from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.mount_file import read_models
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
@@ -108,7 +108,7 @@ def _radio(where: Path) -> dict[str, Any]:
     (where / "site.toml").write_text(Scenario.model_validate(data).to_toml())
     _json("simulate", where / "site.toml", "-o", where / "rec.h5", "--seed", 4)
     _json("process", where / "rec.h5", "-o", where / "result.h5")
-    result = read_result(where / "result.h5")
+    result = open_result(where / "result.h5")
     rows = []
     for i in range(2):
         azimuth, elevation = geometry.azimuth_elevation_from_enu(result.truth.normal_enu[i, 0])

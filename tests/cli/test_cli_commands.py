@@ -14,10 +14,10 @@ from click.testing import CliRunner, Result
 from rfpose.cli._app import app
 from rfpose.cli.convert import FORMAT_NAMES
 from rfpose.cli.demo import write_report
+from rfpose.drawing import save_figure
 from rfpose.pipeline.demo import run_demo, shipped_scenario
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 from rfpose.recording import open_recording
 from rfpose.recording.base import RecordingFormat
 from rfpose.scenario import Scenario, load_scenario
@@ -107,7 +107,7 @@ def test_convert_there_and_back(directory: Path, tmp_path: Path) -> None:
     pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
     _json("convert", directory / "rec.h5", "-o", tmp_path / "drf", "--to", "digital-rf")
     _json("process", tmp_path / "drf", "-o", tmp_path / "r.h5")
-    there, here = read_result(tmp_path / "r.h5"), read_result(directory / "result.h5")
+    there, here = open_result(tmp_path / "r.h5"), open_result(directory / "result.h5")
     np.testing.assert_array_equal(there.poses.normal_enu, here.poses.normal_enu)
     assert there.truth is None
     shown = _run("evaluate", tmp_path / "r.h5")
@@ -175,13 +175,14 @@ def test_a_fault_of_our_own_is_exit_1_in_one_line(directory: Path, monkeypatch: 
 
 
 def test_pictures(directory: Path, tmp_path: Path) -> None:
-    result = read_result(directory / "result.h5")
-    draw_field_map(result, tmp_path / "map.png", evaluation=evaluate(result))
-    draw_field_map(result, tmp_path / "map.svg")
+    result = open_result(directory / "result.h5")
+    save_figure(result.plot(evaluation=evaluate(result)), tmp_path / "map.png")
+    save_figure(result.plot(), tmp_path / "map.svg")
     with open_recording(directory / "rec.h5") as recording:
-        draw_spectrum(recording, tmp_path / "spectrum.png", receiver_id="cal0")
-        with pytest.raises(ValueError, match=r"must end in \.png or \.svg"):
-            draw_spectrum(recording, tmp_path / "spectrum.gif")
+        spectrum = recording.plot(receiver_id="cal0")
+    save_figure(spectrum, tmp_path / "spectrum.png")
+    with pytest.raises(ValueError, match=r"must end in \.png, \.svg"):
+        save_figure(spectrum, tmp_path / "spectrum.gif")
     for name in ("map.png", "spectrum.png"):
         assert (tmp_path / name).read_bytes().startswith(PNG)
     assert "<svg" in (tmp_path / "map.svg").read_text()

@@ -18,11 +18,11 @@ from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
 from rfpose.measurement import noise_of
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.layout import Rules, budget_layout, map_layout, optimise_layout
+from rfpose.pipeline.layout import Rules, budget, layout_map, optimise
 from rfpose.pipeline.layout.site import Postures
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result_summary import summarise as summarise_result
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import check_scenario, load_scenario
 
 SITE = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -72,9 +72,9 @@ def test_the_scenarios_own_estimator_is_that_of_process(tmp_path):
         tones = [{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}]
         site = short_site(tmp_path, heliostat=heliostats, simulation=still, tone=tones)
         recording, result = tmp_path / "rec.h5", tmp_path / "result.h5"
-        simulate_recording(site, recording, seed=1, force=True)
+        simulate(site, seed=1).save(recording, force=True)
         bound = evaluate(process(recording, result, estimator="correlator", force=True)).bound_mrad
-        found = map_layout(site)
+        found = layout_map(site)
         assert found.posture_names == ("simulated sun",)
         assert found.as_dict()["normal_mrad"]["scenario"]["rms"] == pytest.approx(bound, rel=1e-3)
 
@@ -85,11 +85,11 @@ def test_a_site_about_frequency_zero_has_no_carriers_to_compare(tmp_path):
     assert set(found) == {"scenario", "independent", "rigid", "shared-clock", "pivot"}
     assert found["scenario"]["rms"] == pytest.approx(found["rigid"]["rms"])
     with pytest.raises(ScenarioError, match=r"site\.toml: estimator `carrier` .* set `radio.centre_frequency_hz`"):
-        map_layout(site, estimators=["carrier"])
+        layout_map(site, estimators=["carrier"])
     with pytest.raises(ScenarioError, match=r"site\.toml: estimator `reflection` needs a ground"):
-        map_layout(site, estimators=["reflection"])
+        layout_map(site, estimators=["reflection"])
     recording, result = tmp_path / "rec.h5", tmp_path / "result.h5"
-    simulate_recording(site, recording, seed=1)
+    simulate(site, seed=1).save(recording)
     measured = process(recording, result, estimator="correlator")
     assert measured.poses.n_wavelength.max() == 1
     assert list(summarise_result(measured)["integers"]) == ["0.75 MHz"]
@@ -99,8 +99,8 @@ def test_a_site_about_frequency_zero_has_no_carriers_to_compare(tmp_path):
 def test_mirrors_that_differ_have_each_its_own_estimator(tmp_path):
     heliostats = [h.model_dump(exclude_none=True) for h in load_scenario(SITE).heliostat[:2]]
     heliostats[1]["oscillator"] = "separate"
-    both = map_layout(short_site(tmp_path, heliostat=heliostats), sensitivity=True)
-    each = [map_layout(short_site(tmp_path, heliostat=[h])).rms_mrad["scenario"][0] for h in heliostats]
+    both = layout_map(short_site(tmp_path, heliostat=heliostats), sensitivity=True)
+    each = [layout_map(short_site(tmp_path, heliostat=[h])).rms_mrad["scenario"][0] for h in heliostats]
     np.testing.assert_allclose(both.rms_mrad["scenario"], each)
     assert each[1] > 10.0 * each[0]
 
@@ -110,7 +110,7 @@ def test_map_of_a_field_from_csv(tmp_path):
     field.write_text("east_m,north_m,up_m\n20,0,2\n0,25,2\n")
     found = json.loads(run("map", SITE, "--field", field, "--json", "--estimator", "rigid"))
     assert found["heliostats"] == 2
-    own = map_layout(SITE, estimators=["rigid"])
+    own = layout_map(SITE, estimators=["rigid"])
     expected = np.sqrt(np.mean(own.rms_mrad["rigid"][:2] ** 2))
     assert found["normal_mrad"]["rigid"]["rms"] == pytest.approx(expected)
 
@@ -124,7 +124,7 @@ def test_optimise_writes_a_scenario(tmp_path):
     scenario = load_scenario(better)
     assert len(scenario.transmitter) == 11
     assert scenario.transmitter[0].position_enu_m == load_scenario(SITE).transmitter[0].position_enu_m
-    measured = map_layout(better, estimators=["rigid"]).as_dict()["pdop"]["rms"]
+    measured = layout_map(better, estimators=["rigid"]).as_dict()["pdop"]["rms"]
     assert measured == pytest.approx(found["pdop_rms"], rel=1e-9)
 
 
@@ -148,7 +148,7 @@ def test_map_over_a_day_by_posture(tmp_path):
     year = json.loads(run("map", site, "--json", "--estimator", "rigid", "--year", 2026))
     assert {name[:7] for name in year["normal_by_posture_mrad"]["rigid"]} == {f"2026-{m:02d}" for m in range(1, 13)}
     with pytest.raises(ScenarioError, match="latitude_deg"):
-        map_layout(SITE, postures=Postures(day=date(2026, 6, 21)))
+        layout_map(SITE, postures=Postures(day=date(2026, 6, 21)))
 
 
 def test_map_with_line_of_sight_keeps_what_is_seen(tmp_path):
@@ -186,9 +186,9 @@ def test_map_with_the_reflection_estimated(tmp_path):
     ground = "ground = { coefficient = [-0.3, 0.1] }\n"
     site = broken(tmp_path, "[simulation]\n", "[simulation]\n" + ground)
     found = json.loads(run("map", site, "--json", "--estimator", "reflection", "--estimator", "delays"))["normal_mrad"]
-    budget = budget_layout(site, ground="estimated", n_draw=0).as_dict()["lines"]
+    lines = budget(site, ground="estimated", n_draw=0).as_dict()["lines"]
     noise = ("thermal noise", "quantisation", "calibration noise")
-    total = np.sqrt(sum(line["normal_mrad"] ** 2 for line in budget if line["source"] in noise))
+    total = np.sqrt(sum(line["normal_mrad"] ** 2 for line in lines if line["source"] in noise))
     # the calibration's noise is common to mirrors, and what the solver states takes it for each one's own
     assert found["reflection"]["rms"] == pytest.approx(total, rel=3e-3)
     # the ground is one more unknown and one more look at the mirror: of the same order as without it
@@ -286,7 +286,7 @@ def test_undetermined_poses_have_no_budget(tmp_path):
     path = tmp_path / "site.toml"
     path.write_text(text[:begin] + text[end:])
     with pytest.raises(ScenarioError, match="calibration receiver, or a surveyed pivot"):
-        budget_layout(path, pose="independent", n_draw=0)
+        budget(path, pose="independent", n_draw=0)
 
 
 def test_a_person_gets_tables():
@@ -313,7 +313,7 @@ def broken(tmp_path, old, new):
 def test_bad_sites_are_refused(tmp_path, old, new, message):
     path = broken(tmp_path, old, new)
     with pytest.raises(ScenarioError, match=message) as caught:
-        map_layout(path)
+        layout_map(path)
     assert str(path) in str(caught.value)
 
 
@@ -324,9 +324,9 @@ def test_level_transmitters_are_refused(tmp_path):
     path = tmp_path / "level.toml"
     path.write_text(text)
     with pytest.raises(ScenarioError, match=r"one plane.*0\.000, 0\.000, 1\.000.*different heights"):
-        map_layout(path)
+        layout_map(path)
 
 
 def test_constraints_that_cannot_be_met_are_refused():
     with pytest.raises((ScenarioError, GeometryError), match="no room"):
-        optimise_layout(SITE, rules=Rules(separation_m=150.0), starts=1)
+        optimise(SITE, rules=Rules(separation_m=150.0), starts=1)

@@ -13,7 +13,7 @@ from rfpose.cli.track import _METHODS
 from rfpose.errors import RecordingError
 from rfpose.feedback.tracking import METHODS
 from rfpose.pipeline.track import TrackChanges, track
-from rfpose.pipeline.track_file import is_track, read_track
+from rfpose.pipeline.track_file import is_track, open_track
 from rfpose.scenario import load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "tracking_100m.toml"
@@ -48,7 +48,7 @@ def test_table_json_csv_and_picture(site, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == 36
     assert is_track(out)
-    kept = read_track(out)
+    kept = open_track(out)
     assert kept.as_dict() == {k: v for k, v in found.items() if k not in ("result", "csv", "picture")}
     mirror = [float(row["normal_rms_mrad"]) for row in rows if row["method"] == "radio-both"]
     np.testing.assert_allclose(mirror, 1e3 * kept.methods["radio-both"].scores["heliostat_rms_rad"], rtol=1e-5)
@@ -196,7 +196,7 @@ def test_what_happened_is_told_and_kept(site, tmp_path):
     offered = sum(m["offered_kwh_per_m2"] for m in modes.values())
     assert found["availability"] == pytest.approx(1.0 - lost / offered)
     assert found["energy_kwh_per_m2"] == pytest.approx(offered - lost)
-    kept = read_track(out)
+    kept = open_track(out)
     assert kept.as_dict()["methods"]["open-loop"] == found
     assert [event.what for event in kept.scenario.tracking.event] == ["emergency", "approach", "release"]
     assert kept.methods["open-loop"].happened[0] == day
@@ -208,7 +208,7 @@ def test_what_happened_is_told_and_kept(site, tmp_path):
     without = json.loads(off.stdout)["methods"]["open-loop"]
     assert "field_control" not in without
     assert list(without["modes"]) == ["track"]
-    assert read_track(tmp_path / "off.h5").scenario.tracking.field_control is None
+    assert open_track(tmp_path / "off.h5").scenario.tracking.field_control is None
 
 
 def test_stopped_in_an_emergency_and_resumed_equals_undisturbed(site, tmp_path):
@@ -263,4 +263,4 @@ def test_a_file_of_another_kind_is_told(site, tmp_path):
     other.write_bytes(b"no HDF5")
     assert not is_track(other)
     with pytest.raises(RecordingError, match="truncated or another kind"):
-        read_track(other)
+        open_track(other)

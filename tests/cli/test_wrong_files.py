@@ -11,7 +11,7 @@ from rfpose.errors import install_remedy
 from rfpose.kinds import kind_of
 from rfpose.pipeline.mount_file import MODEL_FORMAT
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
 from rfpose.scenario import check_scenario, load_scenario
 
@@ -34,7 +34,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     names = {"recording": "rec.h5", "result": "result.h5", "track": "run.h5", "scenario": "site.toml"}
     paths = {kind: folder / name for kind, name in names.items()}
     paths["scenario"].write_text(check_scenario(data).to_toml())
-    simulate_recording(paths["scenario"], paths["recording"], seed=1)
+    simulate(paths["scenario"], seed=1).save(paths["recording"])
     process(paths["recording"], paths["result"], estimator="correlator")
     track(paths["scenario"], paths["track"], methods=("open-loop", "encoder"))
     for name, text in (
@@ -149,7 +149,7 @@ def test_reflections_without_radio_frequencies_are_refused_in_the_users_words(tm
     data["site"] |= {"latitude_deg": -33.9, "longitude_deg": 18.9}
     site = tmp_path / "site.toml"
     site.write_text(check_scenario(data).to_toml())
-    simulate_recording(site, tmp_path / "rec.h5", seed=1)
+    simulate(site, seed=1).save(tmp_path / "rec.h5")
     for command in (
         ("layout", "budget", site),
         ("process", tmp_path / "rec.h5", "-o", tmp_path / "out.h5"),

@@ -19,22 +19,22 @@ from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.series import Quantity, read_series_csv
 from rfpose.feedback.sun import Site
-from rfpose.layout.fields import read_positions
 from rfpose.pipeline.aim import plan_commands
-from rfpose.pipeline.calibrate import calibrate_paint, write_models
+from rfpose.pipeline.calibrate import calibrate
 from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_radio
 from rfpose.pipeline.evaluate import evaluate, read_truth
 from rfpose.pipeline.field_view import field_of_result, field_of_scenario, history
 from rfpose.pipeline.inspect import inspect_file
 from rfpose.pipeline.mount_file import read_models
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 from rfpose.pipeline.result_summary import write_poses_csv
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
-from rfpose.pipeline.track_file import read_track, write_track_csv
+from rfpose.pipeline.track_file import open_track
 from rfpose.pipeline.track_view import picture_of_track
-from rfpose.scenario import Scenario, check_scenario, load_scenario
+from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
+from rfpose.tables import write_csv
 
 # what is wrong may well give NaN, of which numpy warns
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -58,7 +58,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     paths = {name: folder / f"{name}.h5" for name in ("recording", "result")}
     paths["scenario"] = folder / "site.toml"
     paths["scenario"].write_text(small_site().to_toml())
-    simulate_recording(paths["scenario"], paths["recording"], seed=1)
+    simulate(paths["scenario"], seed=1).save(paths["recording"])
     process(paths["recording"], paths["result"], estimator="correlator")
     return paths
 
@@ -94,7 +94,7 @@ def test_damaged_results(files, tmp_path, seed):
         how = damage_bytes(path, rng) if k % 5 == 0 else damage_hdf5(path, rng)
         try:
             refused(path, inspect_file, how)
-            result = refused(path, read_result, how)
+            result = refused(path, open_result, how)
             if result is None:
                 continue
             write_poses_csv(result, tmp_path / "poses.csv")
@@ -114,10 +114,10 @@ def test_damaged_tracking_runs(tracked, tmp_path, seed):
         how = damage_bytes(path, rng) if k % 5 == 0 else damage_hdf5(path, rng)
         try:
             refused(path, inspect_file, how)
-            run = refused(path, read_track, how)
+            run = refused(path, open_track, how)
             if run is not None:
                 picture_of_track(run)
-                write_track_csv(run, tmp_path / "run.csv")
+                write_csv(tmp_path / "run.csv", *run.table())
         except Exception as error:
             raise AssertionError(f"seed {seed}, {k}, {how}: {error!r}") from error
 
@@ -139,7 +139,7 @@ def test_damaged_values_in_a_runs_tables(tracked, tmp_path):
                 del group["happened"]
                 group["happened"] = as_json(table)
         try:
-            run = refused(path, read_track, how)
+            run = refused(path, open_track, how)
             if run is not None:
                 run.ranking()
                 picture_of_track(run)
@@ -177,7 +177,7 @@ def test_damaged_scenarios(files, tmp_path, seed):
 
 def test_damaged_truths(files, tmp_path):
     rng = np.random.default_rng(3)
-    result = read_result(files["result"])
+    result = open_result(files["result"])
     sound = {
         "heliostats": [
             {
@@ -269,10 +269,10 @@ def test_byte_order_marks_and_semicolons(files, tmp_path):
 
 def test_values_that_stand_in_another_file_are_not_read(files, tracked, tmp_path):
     for source, place, read in (
-        (files["result"], "poses/normal_enu", read_result),
-        (files["result"], "scenario", read_result),
-        (tracked, "time/unix_s", read_track),
-        (tracked, "method/radio/happened", read_track),
+        (files["result"], "poses/normal_enu", open_result),
+        (files["result"], "scenario", open_result),
+        (tracked, "time/unix_s", open_track),
+        (tracked, "method/radio/happened", open_track),
     ):
         path = copied(source, tmp_path)
         with h5py.File(path, "r+") as file:
@@ -315,7 +315,7 @@ def test_damaged_paint_directories(paint, tmp_path, seed):
 def test_damaged_models(paint, tmp_path, seed):
     rng = np.random.default_rng(seed)
     model = tmp_path / "model.json"
-    write_models(model, calibrate_paint(paint, free="offsets"))
+    calibrate(paint, parameters="offsets").save(model)
     content = model.read_text()
     for k in range(60):
         model.write_text(content)

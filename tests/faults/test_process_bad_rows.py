@@ -18,7 +18,7 @@ from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_summary import summarise
 from rfpose.recording import RecordingWriter
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.simulate import Chunk, Simulator
+from rfpose.simulator import Chunk, Simulator
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 N_SAMPLE = 8000
@@ -176,7 +176,7 @@ def test_receiver_that_is_not_in_the_recording(
     site.write_text(_scenario(add_heliostat).to_toml())
     recording = _record(tmp_path / "rec.h5", _scenario())
     with caplog.at_level(logging.WARNING):
-        result = process(recording, tmp_path / "result.h5", scenario_path=site)
+        result = process(recording, tmp_path / "result.h5", scenario=site)
     assert "differs from the given one" in caplog.text
     assert "lacks receivers H05_r0, H05_r1, H05_r2" in caplog.text
     assert np.all(result.tones.status[:, 6:9] == LineStatus.NOT_RECORDED)
@@ -235,7 +235,7 @@ def test_hopeless_sites_are_refused_before_any_work(
     site = tmp_path / "site.toml"
     site.write_text(_scenario(change).to_toml())
     with pytest.raises(error, match=message):
-        process(recording, tmp_path / "result.h5", scenario_path=site)
+        process(recording, tmp_path / "result.h5", scenario=site)
     assert [path.name for path in tmp_path.iterdir()] == ["site.toml"]
 
 

@@ -13,8 +13,8 @@ import pytest
 from rfpose.errors import RecordingError
 from rfpose.pipeline import measure
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import read_result
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.result_file import open_result
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -52,7 +52,7 @@ def _scenario(**simulation: object) -> Scenario:
 def _simulate(directory: Path, *, seed: int = 1, name: str = "rec.h5") -> Path:
     site = directory / "site.toml"
     site.write_text(_scenario().to_toml())
-    simulate_recording(site, directory / name, seed=seed, force=True)
+    simulate(site, seed=seed).save(directory / name, force=True)
     return directory / name
 
 
@@ -142,11 +142,11 @@ def test_disk_full_in_the_journal_names_it(recording: Path, tmp_path: Path) -> N
 def test_existing_result_is_refused_before_any_work(recording: Path, tmp_path: Path) -> None:
     result = tmp_path / "result.h5"
     result.write_text("dear")
-    with pytest.raises(RecordingError, match=r"result\.h5: exists already.*--force"):
+    with pytest.raises(RecordingError, match=r"result\.h5: exists already.*`force=True`"):
         process(tmp_path / "absent.h5", result)
     assert result.read_text() == "dear"
     process(recording, result, force=True)
-    read_result(result)
+    open_result(result)
 
 
 def test_unfinished_work_of_another_recording_is_not_mixed_in(
@@ -155,7 +155,7 @@ def test_unfinished_work_of_another_recording_is_not_mixed_in(
     other = _simulate(tmp_path, seed=2, name="other.h5")
     result = tmp_path / "result.h5"
     _stop_after(recording, result, 11, monkeypatch)
-    with pytest.raises(RecordingError, match=r"result\.h5\.partial.*different: recording.*--force"):
+    with pytest.raises(RecordingError, match=r"result\.h5\.partial.*different: recording.*`force=True`"):
         process(other, result)
     with pytest.raises(RecordingError, match="different: estimator"):
         process(recording, result, estimator="correlator")

@@ -118,7 +118,7 @@ def test_nothing_outside_the_recording_is_read_unasked(make, private, format, ho
             start, count = recording.blocks("a")[0].tolist()
             return recording.read("a", start, count)
 
-    with pytest.raises(RecordingError, match=r"is not read; .*add `--follow-links`") as caught:
+    with pytest.raises(RecordingError, match=r"is not read; .*add `follow_links=True`") as caught:
         read()
     assert str(path) in str(caught.value)
     if how == "scenario link":
@@ -162,7 +162,7 @@ def test_the_flag_is_the_same_on_every_command(make, private, tmp_path, argument
     arguments = [str(tmp_path / item) if item == "out.h5" else item for item in arguments]
     refused = CliRunner().invoke(app, [*arguments, str(path)])
     assert refused.exit_code == 3
-    assert "add `--follow-links`" in refused.output
+    assert "add --follow-links" in refused.output
     assert not (tmp_path / "out.h5").exists()
     allowed = CliRunner().invoke(app, [*arguments, str(path), "--follow-links"])
     assert "follow-links" not in allowed.output

@@ -14,7 +14,7 @@ import pytest
 from rfpose.pipeline.evaluate import Evaluation, evaluate, read_truth
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -40,7 +40,7 @@ def _site(path: Path) -> Path:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("consistency")
-    simulate_recording(_site(directory / "site.toml"), directory / "rec.h5", seed=11)
+    simulate(_site(directory / "site.toml"), seed=11).save(directory / "rec.h5")
     return directory / "rec.h5"
 
 

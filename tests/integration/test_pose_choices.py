@@ -19,9 +19,9 @@ from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import read_result, write_result
+from rfpose.pipeline.result_file import open_result, write_result
 from rfpose.pipeline.result_summary import summarise
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.scenario import Scenario, load_scenario
 
@@ -54,7 +54,7 @@ def site(
 
 def recorded(scenario: Scenario, directory: Path, name: str) -> Path:
     (directory / f"{name}.toml").write_text(scenario.to_toml())
-    simulate_recording(directory / f"{name}.toml", directory / f"{name}.h5", seed=3)
+    simulate(directory / f"{name}.toml", seed=3).save(directory / f"{name}.h5")
     return directory / f"{name}.h5"
 
 
@@ -100,7 +100,7 @@ def test_the_coefficient_and_its_sigma_are_in_the_result(estimated: Result, two_
     assert np.all(np.abs(error.imag) < 5.0 * table.coefficient_sigma[..., 0, 1])
     assert table.coefficient_sigma.max() < 1e-3
     assert np.all(table.probability_direct < 1e-3)
-    again = read_result(two_ray.with_name("estimated.h5"))
+    again = open_result(two_ray.with_name("estimated.h5"))
     assert again.settings["reflection"] == "estimate"
     summary = summarise(again)["reflection"]
     assert (summary["needed"], summary["coefficients"]["ground"]["status"]) == (N_POSE, "estimated")
@@ -122,7 +122,7 @@ def test_a_given_coefficient_is_used_as_given(two_ray: Path, tmp_path: Path, fre
     known = scenario.model_dump(exclude_none=True) | {"reflection": {"model": "known", "coefficient": COEFFICIENT}}
     path = tmp_path / "known.toml"
     path.write_text(Scenario.model_validate(known).to_toml())
-    result = process(two_ray, tmp_path / "r.h5", scenario_path=path, estimator="correlator")
+    result = process(two_ray, tmp_path / "r.h5", scenario=path, estimator="correlator")
     assert evaluate(result).normal_error_mrad.rms <= 1.3 * free_rms
     assert result.reflection is not None
     assert np.all(result.reflection.coefficient_sigma == 0.0)
@@ -259,7 +259,7 @@ def test_a_transmitter_elsewhere_than_surveyed_is_left_out(clean: Path, tmp_path
     east, north, up = data["transmitter"][6]["position_enu_m"]
     data["transmitter"][6]["position_enu_m"] = (east + 0.5, north, up)
     (tmp_path / "moved.toml").write_text(Scenario.model_validate(data).to_toml())
-    result = process(clean, tmp_path / "r.h5", scenario_path=tmp_path / "moved.toml", estimator="correlator")
+    result = process(clean, tmp_path / "r.h5", scenario=tmp_path / "moved.toml", estimator="correlator")
     excluded = summarise(result)["integrity"]["excluded"]
     assert list(excluded) == ["T7"]
     assert sum(excluded["T7"].values()) == N_POSE
@@ -271,7 +271,7 @@ def test_a_pivot_that_contradicts_the_data_is_flagged_not_averaged(clean: Path, 
     east, north, up = data["heliostat"][2]["pivot_enu_m"]
     data["heliostat"][2]["pivot_enu_m"] = (east + 0.3, north, up)
     (tmp_path / "off.toml").write_text(Scenario.model_validate(data).to_toml())
-    result = process(clean, tmp_path / "r.h5", scenario_path=tmp_path / "off.toml", estimator="correlator")
+    result = process(clean, tmp_path / "r.h5", scenario=tmp_path / "off.toml", estimator="correlator")
     table = result.integrity
     assert table is not None
     assert np.all(table.prior_rejected[:, 2, 0])
@@ -353,7 +353,7 @@ def test_learned_covariance_and_delays_tell_the_truth(learned: Result) -> None:
 
 def test_delays_learned_are_the_same_from_the_file(learned: Result, tmp_path: Path) -> None:
     write_result(learned, tmp_path / "r.h5")
-    again = read_result(tmp_path / "r.h5")
+    again = open_result(tmp_path / "r.h5")
     assert again.delays is not None
     assert learned.delays is not None
     np.testing.assert_array_equal(again.delays.delay_s, learned.delays.delay_s)

@@ -16,7 +16,7 @@ from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import check_solvable
 from rfpose.scenario import Scenario, load_scenario
 
@@ -44,7 +44,7 @@ def site(mirror: dict[str, Any], *, drift_rad: float = DRIFT_RAD, calibration: b
 
 def solved(directory: Path, mirror: dict[str, Any], *, drift_rad: float) -> Result:
     (directory / "site.toml").write_text(site(mirror, drift_rad=drift_rad, calibration=False).to_toml())
-    simulate_recording(directory / "site.toml", directory / "rec.h5", seed=5, force=True)
+    simulate(directory / "site.toml", seed=5).save(directory / "rec.h5", force=True)
     return process(directory / "rec.h5", directory / "r.h5", estimator="correlator", force=True)
 
 
@@ -81,9 +81,9 @@ def test_calibration_receivers_of_a_recording_can_be_left_alone(tmp_path: Path) 
     mirror = CLOCKS["one clock"]
     (tmp_path / "site.toml").write_text(site(mirror).to_toml())
     (tmp_path / "bare.toml").write_text(site(mirror, calibration=False).to_toml())
-    simulate_recording(tmp_path / "site.toml", tmp_path / "rec.h5", seed=5)
+    simulate(tmp_path / "site.toml", seed=5).save(tmp_path / "rec.h5")
     both = [
-        evaluate(process(tmp_path / "rec.h5", tmp_path / f"{name}.h5", estimator="correlator", scenario_path=path))
+        evaluate(process(tmp_path / "rec.h5", tmp_path / f"{name}.h5", estimator="correlator", scenario=path))
         for name, path in (("with", None), ("without", tmp_path / "bare.toml"))
     ]
     assert [e.failed for e in both] == [0, 0]
@@ -98,7 +98,7 @@ def test_an_old_calibration_does_no_harm(tmp_path: Path) -> None:
         for f in range(3, N_FRAME)
     ]
     (tmp_path / "site.toml").write_text(Scenario.model_validate(data).to_toml())
-    simulate_recording(tmp_path / "site.toml", tmp_path / "rec.h5", seed=5)
+    simulate(tmp_path / "site.toml", seed=5).save(tmp_path / "rec.h5")
     rigid = evaluate(process(tmp_path / "rec.h5", tmp_path / "r.h5", estimator="correlator"))
     fits = evaluate(process(tmp_path / "rec.h5", tmp_path / "i.h5", estimator="correlator", pose="independent"))
     assert rigid.failed == 0

@@ -15,9 +15,9 @@ from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.inspect import inspect_file
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 from rfpose.pipeline.result_summary import summarise
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -56,10 +56,10 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     (directory / "site.toml").write_text(
         site({"filtered": True, "rate_walk_radps_per_sqrt_s": 1e-7, "rate_sigma_radps": 1e-3}).to_toml()
     )
-    simulate_recording(directory / "site.toml", directory / "rec.h5", seed=2)
+    simulate(directory / "site.toml", seed=2).save(directory / "rec.h5")
     process(directory / "rec.h5", directory / "r.h5", estimator="correlator")
     assert inspect_file(directory / "r.h5")["filtered"]["sigma_mrad"] is not None
-    return read_result(directory / "r.h5")
+    return open_result(directory / "r.h5")
 
 
 def test_filtered_normals_are_better_and_say_by_how_much(result: Result) -> None:
@@ -109,5 +109,5 @@ def test_a_filter_is_refused_where_it_would_claim_too_much() -> None:
         choose(site({}), pose="independent", filtered=True)
     data = site({}).model_dump(exclude_none=True)
     data["heliostat"][2]["receiver_delay_drift_s_per_sqrt_min"] = 1e-12
-    with pytest.raises(ScenarioError, match=r"H03.*common to the frames.*--no-filter"):
+    with pytest.raises(ScenarioError, match=r"H03.*common to the frames.*`filtered=False`"):
         choose(Scenario.model_validate(data), pose="rigid", filtered=True)

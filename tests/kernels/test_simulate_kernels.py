@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rfpose.scenario import parse_scenario
-from rfpose.simulate import _kernels, _rays
+from rfpose.simulator import _kernels, _rays
 
 TURN = 2.0**64
 

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from rfpose.cli._app import app
 from rfpose.pipeline.evaluate import evaluate, read_truth
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 
 pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
 
@@ -95,8 +95,8 @@ def test_rigid_normal_from_digital_rf(
     assert "[[heliostat]]\n" in text
     site.write_text(text.replace("[[heliostat]]\n", f"[[heliostat]]\n{mirror}\n"))
     result = tmp_path / "result.h5"
-    process(SOURCE / "drf", result, scenario_path=site, estimator="correlator", pose="rigid")
-    found = evaluate(read_result(result), read_truth(SOURCE / "truth.json", read_result(result).scenario))
+    process(SOURCE / "drf", result, scenario=site, estimator="correlator", pose="rigid")
+    found = evaluate(open_result(result), read_truth(SOURCE / "truth.json", open_result(result).scenario))
     figure(f"P6 rigid, {request.node.callspec.id}: normal", found.normal_error_mrad.rms, "mrad")
     assert found.normal_error_mrad.rms == pytest.approx(expected_mrad, abs=tolerance_mrad)
     assert found.normal_error_mrad.rms < 4 * found.sigma_mrad

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rfpose.drawing import save_figure
 from rfpose.errors import RecordingError
 from rfpose.feedback.alarms import alarms
 from rfpose.feedback.calibration import FitStatus, fit
@@ -17,7 +18,7 @@ from rfpose.feedback.prediction import normal_errors_rad
 from rfpose.feedback.selection import fit_chosen
 from rfpose.feedback.sun import sun_position
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits
-from rfpose.pipeline.calibrate import calibrate_paint, draw_errors, write_models
+from rfpose.pipeline.calibrate import calibrate
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
 pytestmark = pytest.mark.skipif(not PAINT.is_dir(), reason=f"the PAINT records are not at {PAINT}")
@@ -163,14 +164,14 @@ def test_algorithms_agree_and_lone_ones_are_left_out():
 
 
 def test_models_and_pictures_are_written(tmp_path):
-    reports = calibrate_paint(PAINT, heliostats=("BH36",))
-    write_models(tmp_path / "m.json", reports)
+    reports = calibrate(PAINT, heliostats=("BH36",))
+    reports.save(tmp_path / "m.json")
     model = json.loads((tmp_path / "m.json").read_text())["heliostat"]["BH36"]
     assert model["parameters"]["canting_right_rad"] == pytest.approx(0.012, abs=0.004)
-    with pytest.raises(RecordingError, match="--force"):
-        write_models(tmp_path / "m.json", reports)
-    write_models(tmp_path / "m.toml", reports)
-    draw_errors(tmp_path / "e.png", reports)
+    with pytest.raises(RecordingError, match="`force=True`"):
+        reports.save(tmp_path / "m.json")
+    reports.save(tmp_path / "m.toml")
+    save_figure(reports.plot(), tmp_path / "e.png")
     assert (tmp_path / "e.png").stat().st_size > 5000
     told = reports[0].as_dict()
     assert told["held_out_median_mrad"] < 0.42

@@ -148,7 +148,7 @@ def test_keys_are_the_contract(result: Result) -> None:
 
 
 def test_no_truth_is_refused(result: Result) -> None:
-    with pytest.raises(InvalidInputError, match="--truth"):
+    with pytest.raises(InvalidInputError, match="`truth=FILE`"):
         evaluate(replace(result, truth=None))
 
 

@@ -416,7 +416,7 @@ def test_conversion_keeps_samples_times_and_gaps(native, tmp_path, format):
 def test_conversion_refuses_and_replaces(native, tmp_path, format):
     out = tmp_path / "out"
     convert(native, out, format=format)
-    with pytest.raises(RecordingError, match=r"exists already.*--force"):
+    with pytest.raises(RecordingError, match=r"exists already.*`force=True`"):
         convert(native, out, format=format)
     convert(native, out, format=format, overwrite=True)
     with open_recording(out) as got:

@@ -325,7 +325,7 @@ def test_writer_outside_with(tmp_path):
 def test_existing_file_is_refused_without_overwrite(tmp_path):
     path = tmp_path / "r.h5"
     path.write_text("mine")
-    with pytest.raises(RecordingError, match=r"exists already.*--force"):
+    with pytest.raises(RecordingError, match=r"exists already.*`force=True`"):
         writer(path)
     assert path.read_text() == "mine"
     with writer(path, overwrite=True) as w:

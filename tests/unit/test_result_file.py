@@ -19,7 +19,7 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import RecordingError
 from rfpose.pipeline import result_file
 from rfpose.pipeline.result import Result, frame_time
-from rfpose.pipeline.result_file import KEYS, is_result, read_result, write_result
+from rfpose.pipeline.result_file import KEYS, is_result, open_result, write_result
 from rfpose.pipeline.result_summary import CSV_COLUMNS, summarise, write_poses_csv
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario, load_scenario
@@ -94,17 +94,17 @@ def _assert_equal(a: Any, b: Any) -> None:
 
 def test_round_trip(result: Result, path: Path) -> None:
     assert result.poses.status.tolist() == [[1, 0], [0, 0]]
-    _assert_equal(result, read_result(path))
+    _assert_equal(result, open_result(path))
 
 
 def test_read_arrays_are_read_only(path: Path) -> None:
     with pytest.raises(ValueError, match="read-only"):
-        read_result(path).poses.normal_enu[0, 0, 0] = 1.0
+        open_result(path).poses.normal_enu[0, 0, 0] = 1.0
 
 
 def test_round_trip_without_truth(result: Result, tmp_path: Path) -> None:
     write_result(replace(result, truth=None), tmp_path / "r.h5")
-    assert read_result(tmp_path / "r.h5").truth is None
+    assert open_result(tmp_path / "r.h5").truth is None
 
 
 def test_equal_results_are_equal_bytes(path: Path, tmp_path: Path) -> None:
@@ -112,14 +112,15 @@ def test_equal_results_are_equal_bytes(path: Path, tmp_path: Path) -> None:
     assert path.read_bytes() == (tmp_path / "again.h5").read_bytes()
 
 
-def test_every_dataset_says_unit_axes_and_meaning(path: Path) -> None:
+def test_every_dataset_says_dimensions_unit_and_meaning(path: Path) -> None:
     with h5py.File(path) as file:
         for name, key in KEYS.items():
             if name in file:
-                assert file[name].attrs["unit"] == key.unit
-                assert file[name].attrs["axes"].count(",") == file[name].ndim - 1
-                assert file[name].attrs["meaning"] == key.meaning
+                assert file[name].attrs["long_name"] == key.meaning
+                assert file[name].attrs.get("units") == (None if key.codes else key.unit)
+                assert [dim[0].name for dim in file[name].dims] == [f"/{dim}" for dim in key.dims]
         assert file["poses/status"].attrs["codes"].startswith("0 solved; 1 fewer than three")
+        assert file["poses/status"].attrs["flag_meanings"].split()[0] == "ok"
 
 
 def test_documentation_names_every_key() -> None:
@@ -136,26 +137,26 @@ def test_truncated(path: Path, kept: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     with pytest.raises(RecordingError, match=r"result\.h5: no result, but truncated.*run `rfpose process` again"):
-        read_result(path)
+        open_result(path)
     assert not is_result(path)
 
 
 def test_not_hdf5(tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_text("a letter")
     with pytest.raises(RecordingError, match=r"a\.h5: no result, but.* another kind of file"):
-        read_result(tmp_path / "a.h5")
+        open_result(tmp_path / "a.h5")
 
 
 def test_absent(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"a\.h5: no such file"):
-        read_result(tmp_path / "a.h5")
+        open_result(tmp_path / "a.h5")
 
 
 def test_hdf5_of_another_kind(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["x"] = 1
     with pytest.raises(RecordingError, match=r"a\.h5: no result, but.* another kind of file"):
-        read_result(tmp_path / "a.h5")
+        open_result(tmp_path / "a.h5")
     assert not is_result(tmp_path / "a.h5")
 
 
@@ -163,7 +164,7 @@ def test_version_of_the_future(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.attrs["version"] = 2
     with pytest.raises(RecordingError, match="version 2"):
-        read_result(path)
+        open_result(path)
 
 
 @pytest.mark.parametrize("name", ["scenario", "settings", "poses/normal_enu", "tones/phase_rad", "truth/normal_enu"])
@@ -171,14 +172,14 @@ def test_missing(path: Path, name: str) -> None:
     with h5py.File(path, "r+") as file:
         del file[name]
     with pytest.raises(RecordingError, match=f"result.h5: `/{name}` is missing"):
-        read_result(path)
+        open_result(path)
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
         (np.zeros((2, 2, 3), "S4"), "holds .S4, not float64"),
-        (np.zeros((2, 3, 3)), r"has shape \(2, 3, 3\), not \(frame, heliostat, 3\)"),
+        (np.zeros((2, 3, 3)), r"has shape \(2, 3, 3\), not \(frame, heliostat, xyz\)"),
         (np.zeros((3, 2, 3)), r"has shape \(3, 2, 3\)"),
         (np.zeros((2, 2)), r"has shape \(2, 2\)"),
         (np.zeros((2, 2, 4)), r"has shape \(2, 2, 4\)"),
@@ -189,7 +190,7 @@ def test_mistyped(path: Path, value: np.ndarray, message: str) -> None:
         del file["poses/normal_enu"]
         file["poses/normal_enu"] = value
     with pytest.raises(RecordingError, match=r"result\.h5: `/poses/normal_enu` " + message):
-        read_result(path)
+        open_result(path)
 
 
 def test_broken_scenario(path: Path) -> None:
@@ -197,7 +198,7 @@ def test_broken_scenario(path: Path) -> None:
         del file["scenario"]
         file["scenario"] = "name = "
     with pytest.raises(RecordingError, match=r"result\.h5:/scenario: not valid TOML"):
-        read_result(path)
+        open_result(path)
 
 
 def test_failed_write_leaves_the_old_file(path: Path, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:

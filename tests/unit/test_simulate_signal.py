@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rfpose.scenario import parse_scenario
-from rfpose.simulate import Simulator, simulator
+from rfpose.simulator import Simulator, simulator
 
 SPEED = 299_792_458.0
 RATE = 1e6

@@ -6,7 +6,7 @@ import pytest
 from rfpose import geometry
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.scenario import parse_scenario
-from rfpose.simulate import Simulator
+from rfpose.simulator import Simulator
 
 SITE = """
 name = "small"

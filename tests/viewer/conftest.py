@@ -15,7 +15,7 @@ if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.env
 
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.app import check_installed
 
@@ -51,7 +51,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("viewer")
     paths = {"scenario": folder / "site.toml", "recording": folder / "rec.h5", "result": folder / "result.h5"}
     paths["scenario"].write_text(small_site().to_toml())
-    simulate_recording(paths["scenario"], paths["recording"], seed=3)
+    simulate(paths["scenario"], seed=3).save(paths["recording"])
     process(paths["recording"], paths["result"])
     return paths
 

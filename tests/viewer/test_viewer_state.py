@@ -14,7 +14,7 @@ from rfpose.errors import InvalidInputError, RecordingError, RfposeError, Scenar
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.field_view import history, project
-from rfpose.pipeline.result_file import read_result
+from rfpose.pipeline.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario, parse_scenario
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
@@ -272,7 +272,7 @@ def test_selection_stays_inside_the_document(files: dict[str, Path]) -> None:
 
 
 def test_history_names_what_the_tests_threw_out(files: dict[str, Path]) -> None:
-    result = read_result(files["result"])
+    result = open_result(files["result"])
     assert result.integrity is not None
     status = np.zeros_like(result.integrity.transmitter_status)
     status[1:, 1, 6] = TransmitterStatus.INTERFERENCE
@@ -289,7 +289,7 @@ def test_history_names_what_the_tests_threw_out(files: dict[str, Path]) -> None:
 
 def test_ellipse_holds_the_covariance(files: dict[str, Path]) -> None:
     """Its semi-axes are 2.448 sigmas: the chi-square of two dimensions at 95 %."""
-    result = read_result(files["result"])
+    result = open_result(files["result"])
     found = history(result, 0)
     outline = found.ellipse_mrad - found.offset_mrad[:, None]
     axes = np.linalg.norm(outline, axis=2)

@@ -13,11 +13,11 @@ from click.testing import CliRunner
 from PySide6.QtCore import QPointF, Qt
 
 from rfpose.cli import _app
+from rfpose.drawing import save_figure
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.track import TrackChanges, track
-from rfpose.pipeline.track_file import Track, read_track
-from rfpose.pipeline.track_pictures import draw_track
+from rfpose.pipeline.track_file import Track, open_track
 from rfpose.pipeline.track_view import MODES, clock, groups, instant_at, local_hour, picture_of_track, what_happened
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.views.tracking import TrackingView
@@ -58,7 +58,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def controlled(runs: dict[str, Path]) -> Track:
-    return read_track(runs["control"])
+    return open_track(runs["control"])
 
 
 def view_of(window: MainWindow, path: Path, wait: Wait) -> TrackingView:
@@ -252,7 +252,7 @@ def test_report_of_a_run_without_field_control(qapp, runs: dict[str, Path], tmp_
 
 @pytest.mark.parametrize("name", ["control", "without"])
 def test_picture_shows_flux_and_modes_where_there_are_any(runs: dict[str, Path], tmp_path: Path, name: str) -> None:
-    draw_track(read_track(runs[name]), tmp_path / "day.svg")
+    save_figure(open_track(runs[name]).plot(), tmp_path / "day.svg")
     text = (tmp_path / "day.svg").read_text()
     written = re.findall(r"<!-- (.*?) -->", text)
     assert any("flux" in each for each in written)
@@ -269,5 +269,5 @@ def test_picture_of_nobody_on_the_receiver(controlled: Track, tmp_path: Path) ->
         series = dict(method.series) | {"rms_rad": dark, "flux": dark, "mode_count": count}
         scores = dict(method.scores) | {"heliostat_rms_rad": np.full(4, np.nan)}
         nothing[name] = dataclasses.replace(method, series=series, scores=scores)
-    draw_track(dataclasses.replace(controlled, methods=nothing), tmp_path / "day.png")
+    save_figure(dataclasses.replace(controlled, methods=nothing).plot(), tmp_path / "day.png")
     assert (tmp_path / "day.png").stat().st_size > 10_000

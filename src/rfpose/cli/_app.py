@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import click
 
 from rfpose import __version__, interruption
-from rfpose.cli._support import Session, emit_json
+from rfpose.cli._support import Session, emit_json, in_options
 from rfpose.errors import RfposeError
 from rfpose.files import release_all
 
@@ -64,7 +64,7 @@ class _LazyGroup(click.Group):
         except KeyboardInterrupt:
             _leave(ctx, session.when_interrupted)
         except RfposeError as error:
-            _fail(ctx, session, str(error), EXIT_BAD_DATA)
+            _fail(ctx, session, in_options(str(error), session.options), EXIT_BAD_DATA)
         except (BrokenPipeError, click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except MemoryError as error:

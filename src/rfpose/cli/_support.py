@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
+import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -17,6 +17,7 @@ import click
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
+from rfpose.shown import plain
 
 __all__ = [
     "Progress",
@@ -31,6 +32,7 @@ __all__ = [
     "examples",
     "follow_links_option",
     "force_option",
+    "in_options",
     "outputs",
     "progress",
     "say",
@@ -48,6 +50,8 @@ class Session:
 
     debug: bool = False
     json: bool = False
+    options: Mapping[str, click.Parameter] = field(default_factory=dict)
+    """Of the running command, by the names that the library has for them."""
     when_interrupted: str = "interrupted; nothing was written"
 
 
@@ -55,11 +59,31 @@ def common_options(function: F) -> F:
     """Add ``--json`` and ``--debug`` to a command."""
 
     def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-        setattr(ctx.ensure_object(Session), str(parameter.name), value)
+        session = ctx.ensure_object(Session)
+        session.options = {str(each.name): each for each in ctx.command.params}
+        setattr(session, str(parameter.name), value)
 
     settings: dict[str, Any] = {"is_flag": True, "expose_value": False, "callback": remember}
     function = click.option("--debug", help="On failure show the traceback.", **settings)(function)
     return click.option("--json", help="Print one JSON object on standard output.", **settings)(function)
+
+
+def in_options(text: str, options: Mapping[str, click.Parameter]) -> str:
+    """Say what the library says of its arguments, such as `force=True`, in a command's options.
+
+    An argument that a message begins with is meant as well; other words in backticks are keys of files.
+    """
+
+    def option(found: re.Match[str]) -> str:
+        parameter, value = options.get(found[1]), found[2].strip("'")
+        if not isinstance(parameter, click.Option):
+            return found[0]
+        if value == "False" and parameter.secondary_opts:
+            return parameter.secondary_opts[0]
+        flag = max(parameter.opts, key=len)
+        return flag if value in ("", "True") else f"{flag} {value}"
+
+    return re.sub(r"`(\w+)=([^`]*)`", option, re.sub(r"^`(\w+)`()", option, text))
 
 
 def force_option(function: F) -> F:
@@ -88,22 +112,7 @@ def wants_json() -> bool:
 
 def emit_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on standard output; what is not finite becomes null."""
-    click.echo(json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False))
-
-
-def _plain(value: Any) -> Any:
-    """Turn arrays, paths, tuples and numpy scalars into what JSON knows."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    return str(value)
+    click.echo(json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def say(text: str) -> None:

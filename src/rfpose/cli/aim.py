@@ -43,7 +43,7 @@ _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct",
 @click.option("--dish", is_flag=True, help="No aim point: the mirror's normal points at the sun.")
 @click.option("--start", required=True, metavar="TIME", help="First time, such as 2026-06-21T06:00Z.")
 @click.option("--hours", default=12.0, show_default=True, help="How long.")
-@click.option("--step", default=600.0, show_default=True, metavar="S", help="From one command to the next [s].")
+@click.option("--step", "step_s", default=600.0, show_default=True, metavar="S", help="Between commands [s].")
 @click.option("--heliostat", "heliostats", multiple=True, metavar="ID", help="Only this one; may be repeated.")
 @click.option("--site", nargs=3, type=float, metavar="LAT LON ALT", help="Of the site's origin [deg, deg, m].")
 @click.option("--next", "n_next", type=click.IntRange(min=0), default=0, help="Postures to propose for measuring.")
@@ -56,7 +56,7 @@ def command(
     dish: bool,
     start: str,
     hours: float,
-    step: float,
+    step_s: float,
     heliostats: tuple[str, ...],
     site: tuple[float, float, float] | None,
     n_next: int,
@@ -72,7 +72,7 @@ def command(
         raise click.UsageError("give either --target E N U, or --dish")
     with outputs(output, inputs=[model], force=force), progress("Aiming"):
         check_there(model)
-        plans = _plans(model, target, start, hours, step, heliostats, site, n_next)
+        plans = _plans(model, target, start, hours, step_s, heliostats, site, n_next)
         if output is not None:
             from rfpose.pipeline.aim import write_commands
 
@@ -91,7 +91,7 @@ def _plans(
     target: tuple[float, float, float] | None,
     start: str,
     hours: float,
-    step: float,
+    step_s: float,
     heliostats: tuple[str, ...],
     site: tuple[float, float, float] | None,
     n_next: int,
@@ -106,7 +106,7 @@ def _plans(
         target_enu_m=target,
         start=start,
         hours=hours,
-        step_s=step,
+        step_s=step_s,
         heliostats=heliostats,
         site=place,
         n_next=n_next,

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
+    Session,
     check_directory,
     check_ending,
     check_there,
@@ -16,6 +18,7 @@ from rfpose.cli._support import (
     emit_json,
     examples,
     force_option,
+    in_options,
     outputs,
     progress,
     say,
@@ -100,15 +103,24 @@ def command(
     with outputs(output, picture, inputs=inputs, force=force), progress("Fitting"):
         check_there(*inputs)
         check_directory(directory)
+        from rfpose.drawing import save_figure
         from rfpose.feedback.mount import PARAMETERS
-        from rfpose.pipeline.calibrate import draw_errors, write_models
 
-        free = tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters
-        reports = _fit(directory, mounts, radio, motors, camera, drone, heliostats, free, algorithm)
+        reports = rfpose.calibrate(
+            directory,
+            mounts=mounts,
+            radio=radio,
+            motors=motors,
+            camera=camera,
+            drone=drone,
+            heliostats=heliostats,
+            parameters=tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters,
+            algorithm=algorithm,
+        )
         if output is not None:
-            write_models(output, reports, settings={"parameters": parameters}, force=force)
+            reports.save(output)
         if picture is not None:
-            draw_errors(picture, reports)
+            save_figure(reports.plot(), picture)
     if wants_json():
         emit_json(
             {
@@ -126,40 +138,6 @@ def command(
     for path in (output, picture):
         if path is not None:
             say(f"wrote {path}")
-
-
-def _fit(
-    directory: Path | None,
-    mounts: Path | None,
-    radio: tuple[Path, ...],
-    motors: Path | None,
-    camera: Path | None,
-    drone: Path | None,
-    heliostats: tuple[str, ...],
-    free: str | tuple[str, ...],
-    algorithm: str,
-) -> Calibrations:
-    """Read what was named and fit it."""
-    from rfpose.pipeline.calibrate import calibrate_mounts, calibrate_paint
-    from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_paint, read_radio
-    from rfpose.pipeline.mount_file import read_models
-
-    if directory is not None and mounts is None and not (radio or camera or drone):
-        return calibrate_paint(directory, heliostats=heliostats, free=free, algorithm=algorithm)
-    gathered = []
-    if directory is not None:
-        records, planned = read_paint(directory, heliostats, algorithm=algorithm)
-        gathered.append(records)
-    if mounts is not None:
-        planned = read_models(mounts)
-    known = {name: stored.mount for name, stored in planned.heliostats.items()}
-    if motors is not None:
-        gathered.append(read_radio(radio, motors))
-    if camera is not None:
-        gathered.append(read_camera(camera, known, planned.site))
-    if drone is not None:
-        gathered.append(read_drone(drone, known))
-    return calibrate_mounts(planned, gathered, heliostats=heliostats, free=free)
 
 
 def _show(reports: Calibrations) -> None:
@@ -190,7 +168,7 @@ def _show(reports: Calibrations) -> None:
         for group in item["undetermined"]:
             say(f"  undetermined, the data cannot tell apart: {', '.join(group)}")
         for note in item["notes"]:
-            say(f"  note: {note}")
+            say(f"  note: {in_options(note, click.get_current_context().ensure_object(Session).options)}")
         if "PAINT" in item["sources"] or item is plain[-1]:
             for number, reason in list(item["skipped"].items())[:_SHOWN_ALARMS]:
                 say(f"  record {number} left out: {reason}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     check_there,
     common_options,
@@ -43,36 +44,17 @@ def command(result: Path, truth: Path | None, follow_links: bool) -> None:
 
     Errors are of the mirror normal; the beam's are twice that.
     """
-    from rfpose.errors import RecordingError
     from rfpose.kinds import check_kind
 
     check_kind(result, wanted="result")
     check_there(truth)
     with progress("Evaluating"):
-        from rfpose.pipeline.result_file import read_result
-
-        found = read_result(result)
-        if truth is None and found.truth is None:
-            raise RecordingError(f"{result}: carries no truth; add --truth FILE (a simulated recording or JSON)")
-        from rfpose.pipeline.evaluate import evaluate, read_truth
-
-        evaluation = evaluate(
-            found, None if truth is None else read_truth(truth, found.scenario, follow_links=follow_links)
-        )
+        evaluation = rfpose.evaluate(result, truth, follow_links=follow_links)
     if wants_json():
         emit_json(evaluation.as_dict())
         return
     show_evaluation(evaluation, title=str(result))
-    rows = [
-        [
-            row.id,
-            str(row.solved),
-            str(row.failed),
-            *(f"{value:.3g}" for value in (row.normal_error_mrad.rms, row.normal_error_mrad.max, row.bound_mrad)),
-        ]
-        for row in evaluation.heliostats
-    ]
-    table("By heliostat [mrad of the normal]", ["", "solved", "failed", "rms", "worst", "bound"], rows)
+    table("By heliostat [mrad of the normal]", *evaluation.figures())
 
 
 def show_evaluation(evaluation: Evaluation, *, title: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     Session,
     common_options,
@@ -104,12 +105,10 @@ def command(
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
     claimed = outputs(output, csv_path, inputs=[recording, scenario], force=force)
     with claimed, progress("Measuring") as on_progress:
-        from rfpose.pipeline.process import process
-
-        result = process(
+        result = rfpose.process(
             recording,
             output,
-            scenario_path=scenario,
+            scenario=scenario,
             estimator=estimator,
             pose=pose,
             reflection=reflection,
@@ -119,11 +118,11 @@ def command(
             force=force,
             on_progress=on_progress,
         )
-        from rfpose.pipeline.result_summary import summarise, write_poses_csv
+        from rfpose.pipeline.result_summary import write_poses_csv
 
         if csv_path is not None:
             write_poses_csv(result, csv_path)
-        summary = summarise(result)
+        summary = result.summary()
     if wants_json():
         emit_json({"result": output, "csv": csv_path, **summary})
         return

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+import rfpose
 from rfpose.cli._support import common_options, emit_json, examples, force_option, outputs, progress, say, wants_json
 
 __all__ = ["command"]
@@ -29,9 +30,9 @@ def command(scenario: Path, output: Path, seed: int, force: bool) -> None:
     SCENARIO is a TOML file; its [simulation] table says how many frames, how much noise and which impairments.
     """
     with outputs(output, inputs=[scenario], force=force), progress("Simulating") as on_progress:
-        from rfpose.pipeline.simulate import simulate_recording
-
-        summary = simulate_recording(scenario, output, seed=seed, force=force, on_progress=on_progress)
+        recording = rfpose.simulate(scenario, seed=seed)
+        recording.save(output, on_progress=on_progress)
+    summary = {"recording": output, **recording.as_dict(), "bytes": output.stat().st_size}
     if wants_json():
         emit_json(summary)
     else:

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     Session,
     check_ending,
@@ -104,9 +105,11 @@ def command(
     happenings = [_event(text) for text in events]
     claimed = outputs(output, csv_path, picture, inputs=[scenario], force=force)
     with claimed, progress("Tracking") as on_progress:
-        from rfpose.pipeline.track import TrackChanges, track
+        from rfpose.drawing import save_figure
+        from rfpose.pipeline.track import TrackChanges
+        from rfpose.tables import write_csv
 
-        found = track(
+        found = rfpose.track(
             scenario,
             output,
             methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
@@ -124,13 +127,9 @@ def command(
             on_progress=on_progress,
         )
         if csv_path is not None:
-            from rfpose.pipeline.track_file import write_track_csv
-
-            write_track_csv(found, csv_path)
+            write_csv(csv_path, *found.table())
         if picture is not None:
-            from rfpose.pipeline.track_pictures import draw_track
-
-            draw_track(found, picture)
+            save_figure(found.plot(), picture)
         summary = found.as_dict()
     if wants_json():
         emit_json({"result": output, "csv": csv_path, "picture": picture, **summary})

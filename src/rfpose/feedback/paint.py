@@ -486,14 +486,14 @@ def _refuse_other_geometry(properties: Mapping[str, Any], kinematics: Mapping[st
     if facing != _FACING:
         raise RecordingError(
             f"{path}: initial_orientation: only {_FACING} (south, as in Jülich) is known, got {facing!r:.40}; "
-            "describe the mount in a file for --mount"
+            "describe the mount in a file for `mounts=`"
         )
     for key in _NO_PLACE:
         value = _number(kinematics.get(key, 0.0), path, f"kinematics_properties.{key}")
         if value != 0.0:
             raise RecordingError(
                 f"{path}: kinematics_properties.{key}: the model has axes that cross and no place for {value:g} m; "
-                "describe the mount in a file for --mount"
+                "describe the mount in a file for `mounts=`"
             )
 
 
@@ -507,7 +507,7 @@ def _actuator(entry: Any, path: Path, axis: int) -> Actuator:
     if kind != "linear":
         raise RecordingError(
             f"{path}: {place}.type_axis: only linear actuators are known in this layout, got {kind!r:.40}; "
-            "describe the mount in a file for --mount"
+            "describe the mount in a file for `mounts=`"
         )
     for name in ("offset_shift", "radius_shift"):
         shift = _number(entry.get(name, 0.0), path, f"{place}.{name}")

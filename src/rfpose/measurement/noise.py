@@ -90,7 +90,7 @@ def first_snr(scenario: Scenario, tone_snr_db: float | None = None) -> float:
         No number of decibels.
     """
     if tone_snr_db is not None and not abs(tone_snr_db) <= _MAX_DB:
-        raise InvalidInputError(f"`--snr` must be a number of decibels within ±{_MAX_DB:g}, got {tone_snr_db}")
+        raise InvalidInputError(f"`tone_snr_db` must be a number of decibels within ±{_MAX_DB:g}, got {tone_snr_db}")
     return float(10.0 ** ((scenario.simulation.tone_snr_db if tone_snr_db is None else tone_snr_db) / 10.0))
 
 

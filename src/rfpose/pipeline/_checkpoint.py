@@ -66,7 +66,7 @@ class Checkpoint:
             differing = ", ".join(sorted(k for k in {*found, *self._key} if found.get(k) != self._key.get(k)))
             raise RecordingError(
                 f"{self._path}: holds the unfinished work of another job (different: {differing}); repeat that job's "
-                "command to finish it, or start over with --force"
+                "command to finish it, or start over with `force=True`"
             )
         return arrays
 

@@ -57,7 +57,7 @@ class Journal:
                 differing = ", ".join(sorted(k for k in {*found, *key} if found.get(k) != key.get(k)))
                 raise RecordingError(
                     f"{directory}: holds the unfinished work of another job (different: {differing}); repeat that "
-                    "job's command to finish it, or start over with --force"
+                    "job's command to finish it, or start over with `force=True`"
                 )
             self.remove()
         elif not resume:

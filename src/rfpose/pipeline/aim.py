@@ -131,7 +131,7 @@ def plan_commands(
     content = read_models(model)
     place = site or content.site
     if place is None:
-        raise InvalidInputError(f"{model}: does not say where it stands; give --site LATITUDE LONGITUDE ALTITUDE")
+        raise InvalidInputError(f"{model}: does not say where it stands; give `site=` (latitude, longitude, altitude)")
     unix_s = _times(start, hours, step_s)
     names = list(heliostats) or list(content.heliostats)
     unknown = [name for name in names if name not in content.heliostats]
@@ -151,13 +151,13 @@ def _times(start: str, hours: float, step_s: float) -> FloatArray:
     """Return the times of the commands [s since 1970 UTC], as many as are sensible."""
     if not (0.0 <= hours <= _MOST_HOURS and 0.0 < step_s < np.inf):
         raise InvalidInputError(
-            f"the time to plan (--hours) must lie between 0 and {_MOST_HOURS:g} h and the step (--step) must be "
+            f"`hours` must lie between 0 and {_MOST_HOURS:g} h and `step_s=` must be "
             f"greater than zero seconds, got {hours:g} h, {step_s:g} s"
         )
     n_step = 3600.0 * hours / step_s
     if n_step > _MOST_TIMES:
         raise InvalidInputError(
-            f"{n_step:.3g} commands a heliostat are more than {_MOST_TIMES}; take a longer step (--step)"
+            f"{n_step:.3g} commands a heliostat are more than {_MOST_TIMES}; take a longer `step_s=`"
         )
     first = unix_seconds([start])[0]
     return np.asarray(first + np.arange(0.0, 3600.0 * hours + 0.5 * step_s, step_s))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from rfpose.drawing import blank_figure
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.alarms import Alarm, alarms
 from rfpose.feedback.calibration import Calibration, FitSettings, fit, resolve_free, sun_convention
@@ -19,11 +19,17 @@ from rfpose.feedback.paint import PaintHeliostat, heliostat_ids, read_heliostat
 from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
 from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
-from rfpose.files import write_atomically
-from rfpose.pipeline.calibration_sources import Gathered
-from rfpose.pipeline.mount_file import MountFile, write_model_file
+from rfpose.pipeline.calibration_sources import Gathered, read_camera, read_drone, read_paint, read_radio
+from rfpose.pipeline.mount_file import MountFile, read_models, write_model_file
+from rfpose.shown import Shown, counted, number
+from rfpose.tables import Tabled
 
-__all__ = ["Calibrations", "HeliostatReport", "calibrate_mounts", "calibrate_paint", "draw_errors", "write_models"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rfpose.pipeline.result import Result
+
+__all__ = ["Calibrations", "HeliostatReport", "calibrate"]
 
 RECEIVER_PLANE = ("receiver_plane_up_rad", "receiver_plane_right_rad")
 RADIO_ALONE = (
@@ -142,8 +148,8 @@ class HeliostatReport:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Calibrations(Sequence[HeliostatReport]):
+@dataclass(frozen=True, slots=True, repr=False)
+class Calibrations(Shown, Tabled, Sequence[HeliostatReport]):
     """Reports of the heliostats that could be fitted, as a sequence, and why others could not.
 
     Attributes
@@ -152,10 +158,13 @@ class Calibrations(Sequence[HeliostatReport]):
         One a heliostat.
     skipped
         Reason by heliostat's name.
+    parameters
+        Which were to be fitted.
     """
 
     reports: tuple[HeliostatReport, ...]
     skipped: Mapping[str, str]
+    parameters: str = AUTO
 
     def __len__(self) -> int:
         return len(self.reports)
@@ -167,40 +176,137 @@ class Calibrations(Sequence[HeliostatReport]):
     def __getitem__(self, index: int | slice) -> HeliostatReport | tuple[HeliostatReport, ...]:
         return self.reports[index]
 
+    def headline(self) -> str:
+        """Return how many were fitted, and how well they predict."""
+        held = np.array([report.held_out_median_rad for report in self.reports])
+        median = number(1e3 * float(np.median(held[np.isfinite(held)]))) if np.isfinite(held).any() else "unknown"
+        return f"{counted(len(self.reports), 'heliostat')} fitted, {len(self.skipped)} left out; held out {median} mrad"
 
-def calibrate_paint(
-    directory: Path,
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return one row a heliostat, of the figures of `table`."""
+        header, rows = self.table()
+        return header, [[cell if isinstance(cell, str) else number(float(cell)) for cell in row] for row in rows]
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a heliostat: records used, median errors [mrad of the normal], parameters determined."""
+        keys = ("used", "train_median_mrad", "held_out_median_mrad", "chronological_median_mrad", "noise_mrad", "rank")
+        found = [report.as_dict() for report in self.reports]
+        return ["heliostat", *keys], [[each["heliostat"], *(each[key] for key in keys)] for each in found]
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the calibrated mounts as JSON or TOML, by the ending of ``path``.
+
+        Raises
+        ------
+        RecordingError
+            Another ending, or the file exists and ``force`` is not set.
+        """
+        sites = [report.site for report in self.reports]
+        write_model_file(
+            path,
+            {report.id: report.calibration for report in self.reports},
+            site=sites[0] if sites else None,
+            settings={"parameters": self.parameters},
+            undetermined={report.id: report.calibration.undetermined for report in self.reports},
+            force=force,
+        )
+
+    def plot(self) -> Figure:
+        """Draw each heliostat's errors in the order of its records, held-out median grey, shifts red."""
+        figure = blank_figure(9.0, 2.6 * len(self.reports))
+        for i, report in enumerate(self.reports, start=1):
+            axes = figure.add_subplot(len(self.reports), 1, i)
+            axes.semilogy(1e3 * report.calibration.error_rad, ".", color="tab:blue", markersize=4)
+            for alarm in report.alarms:
+                if alarm.kind == "shift":
+                    axes.axvline(alarm.first - 0.5, color="tab:red", linewidth=0.8)
+            axes.axhline(1e3 * report.held_out_median_rad, color="0.5", linewidth=0.8)
+            axes.set_ylabel("normal error [mrad]")
+            axes.set_title(f"{report.id}: grey = held-out median, red = shift", fontsize=9, loc="left")
+        axes.set_xlabel("record, in the order of time")
+        return figure
+
+
+def calibrate(
+    paint: str | Path | None = None,
     *,
+    mounts: MountFile | str | Path | None = None,
+    radio: Sequence[Result | str | Path] = (),
+    motors: str | Path | None = None,
+    camera: str | Path | None = None,
+    drone: str | Path | None = None,
     heliostats: Sequence[str] = (),
-    free: str | Sequence[str] = AUTO,
+    parameters: str | Sequence[str] = AUTO,
+    algorithm: str = "both",
     settings: FitSettings | None = None,
     seed: int = 0,
-    algorithm: str = "both",
 ) -> Calibrations:
-    """Calibrate heliostats of a PAINT directory.
+    """Fit heliostats' mounts to measurements, all of a heliostat's in one fit, and judge the fits.
+
+    A heliostat that cannot be read or fitted is left out, with the reason; the others go on.
 
     Parameters
     ----------
-    directory
-        Folder with the heliostats' folders.
+    paint
+        Folder of PAINT records, with the heliostats' folders in it.
+    mounts
+        As planned or as calibrated before, or the file of them: where the fit begins. None: those that PAINT describes.
+    radio, motors
+        Results, or their files, and the CSV of motor positions that belongs to them.
+    camera
+        Folder of pictures of a target.
+    drone
+        CSV of a drone's log.
     heliostats
-        Names; empty: all.
-    free
-        ``"auto"``: as many as the records carry, chosen for each heliostat (`selection`); or a parameter set, or names.
+        Names; none: all that were measured.
+    parameters
+        ``"auto"``: as many as the records carry, chosen for each heliostat; or a parameter set, or names.
+    algorithm
+        Focal spot of PAINT records: ``both``, ``any``, ``HeliOS`` or ``UTIS``.
     settings
         Of the fit.
     seed
-        Of the random splits.
-    algorithm
-        As for `paint.read_heliostat`.
+        Of the random splits that judge it.
 
     Raises
     ------
+    InvalidInputError
+        Nothing to fit, mounts or motor positions missing, a heliostat that has no mount or was not measured.
     RfposeError
-        No heliostat at all could be read and fitted.
-    """
-    _check_free(free)
+        A file cannot be read; no heliostat at all could be fitted.
 
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> rf.calibrate("paint/", heliostats=["BF57"]).save("models.json")  # doctest: +SKIP
+    """
+    _check_free(parameters)
+    if paint is None and mounts is None:
+        raise InvalidInputError("nothing says where the fit begins: give `paint=DIRECTORY` or `mounts=FILE`")
+    if bool(radio) != (motors is not None):
+        raise InvalidInputError("`radio=` and `motors=` belong together: a pose alone does not say what the motors did")
+    how = _How(parameters, settings, seed)
+    if paint is not None and mounts is None and not (radio or camera or drone):
+        return _calibrate_paint(Path(paint), heliostats, algorithm, how)
+    gathered = []
+    if paint is not None:
+        records, planned = read_paint(Path(paint), heliostats, algorithm=algorithm)
+        gathered.append(records)
+    if mounts is not None:
+        planned = mounts if isinstance(mounts, MountFile) else read_models(mounts)
+    known = {name: stored.mount for name, stored in planned.heliostats.items()}
+    if motors is not None:
+        gathered.append(read_radio(radio, Path(motors)))
+    if camera is not None:
+        gathered.append(read_camera(Path(camera), known, planned.site))
+    if drone is not None:
+        gathered.append(read_drone(Path(drone), known))
+    if not gathered:
+        raise InvalidInputError("nothing was measured: besides mounts give `paint=`, `radio=`, `camera=` or `drone=`")
+    return _calibrate_mounts(planned, gathered, heliostats, how)
+
+
+def _calibrate_paint(directory: Path, heliostats: Sequence[str], algorithm: str, how: _How) -> Calibrations:
     def one(name: str) -> HeliostatReport:
         data = read_heliostat(directory, name, algorithm=algorithm)
         made = Measurements.from_spots(
@@ -208,9 +314,9 @@ def calibrate_paint(
         )
         _check_paint_sun(directory / name, data, made)
         part = _Part("PAINT", made, tuple(map(str, data.record_ids)))
-        return _report(name, data.mount, data.site, [part], dict(data.skipped), _How(free, settings, seed), data.notes)
+        return _report(name, data.mount, data.site, [part], dict(data.skipped), how, data.notes)
 
-    return _each(_paint_names(directory, heliostats), one)
+    return _each(_paint_names(directory, heliostats), one, how)
 
 
 def _check_free(free: str | Sequence[str]) -> None:
@@ -230,7 +336,7 @@ def _paint_names(directory: Path, heliostats: Sequence[str]) -> Sequence[str]:
     return heliostats or found
 
 
-def _each(names: Iterable[str], one: Callable[[str], HeliostatReport]) -> Calibrations:
+def _each(names: Iterable[str], one: Callable[[str], HeliostatReport], how: _How) -> Calibrations:
     """Calibrate one after the other; who cannot be does not keep the others from it."""
     reports, errors = [], {}
     for name in names:
@@ -242,7 +348,9 @@ def _each(names: Iterable[str], one: Callable[[str], HeliostatReport]) -> Calibr
         name, first = next(iter(errors.items()))
         others = f" ({len(errors) - 1} more could not be fitted either)" if len(errors) > 1 else ""
         raise type(first)(f"heliostat {name}: {first}{others}") from first
-    return Calibrations(reports=tuple(reports), skipped={name: str(error) for name, error in errors.items()})
+    skipped = {name: str(error) for name, error in errors.items()}
+    named = how.free if isinstance(how.free, str) else ",".join(how.free)
+    return Calibrations(reports=tuple(reports), skipped=skipped, parameters=named)
 
 
 def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> None:
@@ -255,40 +363,10 @@ def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> 
         )
 
 
-def calibrate_mounts(
-    mounts: MountFile,
-    gathered: Sequence[Gathered],
-    *,
-    heliostats: Sequence[str] = (),
-    free: str | Sequence[str] = AUTO,
-    settings: FitSettings | None = None,
-    seed: int = 0,
+def _calibrate_mounts(
+    mounts: MountFile, gathered: Sequence[Gathered], heliostats: Sequence[str], how: _How
 ) -> Calibrations:
-    """Calibrate mounts from whatever sources there are, all of a heliostat's in one fit.
-
-    Parameters
-    ----------
-    mounts
-        As planned, or as calibrated before: where the fit begins.
-    gathered
-        Measurements by source and heliostat. The receivers' plane is fitted along where radio and another source meet.
-    heliostats
-        Names; empty: all that were measured.
-    free
-        As for `calibrate_paint`.
-    settings
-        Of the fit.
-    seed
-        Of the random splits.
-
-    Raises
-    ------
-    InvalidInputError
-        A heliostat that is asked for has no mount, or no measurement.
-    RfposeError
-        No heliostat at all could be fitted.
-    """
-    _check_free(free)
+    """Calibrate mounts from all sources; the receivers' plane, too, where radio and another source meet."""
     measured = {name for source in gathered for name in source.measurements}
     skipped = {name: why for source in gathered for name, why in source.left_out.items()}
     for name in heliostats:
@@ -306,16 +384,16 @@ def calibrate_mounts(
                 made = source.measurements[name]
                 parts.append(_Part(source.source, made, tuple(f"{source.source} {i}" for i in range(len(made)))))
         mount = mounts.heliostats[name].mount
-        return _report(name, mount, mounts.site, parts, skipped, _How(free, settings, seed))
+        return _report(name, mount, mounts.site, parts, skipped, how)
 
-    found = _each(heliostats or sorted(measured), one)
+    found = _each(heliostats or sorted(measured), one, how)
     failed = {name: why for source in gathered for name, why in source.failed.items()}
-    return Calibrations(reports=found.reports, skipped={**failed, **found.skipped})
+    return replace(found, skipped={**failed, **found.skipped})
 
 
 def _no_mount(name: str, mounts: MountFile) -> str:
     known = ", ".join(list(mounts.heliostats)[:8])
-    return f"heliostat {name!r} has no mount; known are {known}; add it to the file of --mount"
+    return f"heliostat {name!r} has no mount; known are {known}; add it to the file of mounts"
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,7 +475,7 @@ def _notes(mount: Mount, calibration: Calibration, *, radio_alone: bool) -> list
             unit = 1e3 * float(np.median(made.sigma_rad))
             notes.append(
                 f"the measurements do not carry these {len(found.free)} parameters: time-blocks held out scatter by "
-                f"{unit * own:.2f} mrad, with auto by {unit * best:.2f}; use --parameters {AUTO}"
+                f"{unit * own:.2f} mrad, with auto by {unit * best:.2f}; use `parameters={AUTO}`"
             )
     return notes
 
@@ -409,50 +487,3 @@ def _try_split(split: Any, mount: Mount, made: Measurements, **how: Any) -> Held
     except InvalidInputError:
         return None
     return found
-
-
-def write_models(
-    path: Path,
-    reports: Sequence[HeliostatReport],
-    *,
-    settings: Mapping[str, Any] | None = None,
-    force: bool = False,
-) -> None:
-    """Write calibrated mounts as JSON or TOML, by the file's ending.
-
-    Raises
-    ------
-    RecordingError
-        Another ending, or the file exists and ``force`` is not set.
-    """
-    sites = [report.site for report in reports]
-    write_model_file(
-        path,
-        {report.id: report.calibration for report in reports},
-        site=sites[0] if sites else None,
-        settings=settings,
-        undetermined={report.id: report.calibration.undetermined for report in reports},
-        force=force,
-    )
-
-
-def draw_errors(path: Path, reports: Sequence[HeliostatReport]) -> None:
-    """Draw each heliostat's errors in the order of its records, shifts marked, to an image file."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 2.6 * len(reports)), layout="constrained")
-    FigureCanvasAgg(figure)
-    for i, report in enumerate(reports, start=1):
-        axes = figure.add_subplot(len(reports), 1, i)
-        axes.semilogy(1e3 * report.calibration.error_rad, ".", color="tab:blue", markersize=4)
-        for alarm in report.alarms:
-            if alarm.kind == "shift":
-                axes.axvline(alarm.first - 0.5, color="tab:red", linewidth=0.8)
-        axes.axhline(1e3 * report.held_out_median_rad, color="0.5", linewidth=0.8)
-        axes.set_ylabel("normal error [mrad]")
-        axes.set_title(f"{report.id}: grey = held-out median, red = shift", fontsize=9, loc="left")
-    axes.set_xlabel("record, in the order of time")
-    image = io.BytesIO()
-    figure.savefig(image, format=path.suffix[1:], dpi=120)
-    write_atomically(path, image.getvalue())

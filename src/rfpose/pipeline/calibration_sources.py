@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.foreign import load_toml, read_text
 from rfpose.pipeline.mount_file import MountFile, StoredMount
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.result import Result
 
 __all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 
@@ -62,13 +65,13 @@ class Gathered:
     failed: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
+def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
     """Take solved poses of results, each with the motor positions that were logged nearest to its frame.
 
     Parameters
     ----------
     results
-        Files that ``rfpose process`` wrote.
+        As `rfpose.process` gives them, or files of them.
     motors
         CSV: time_utc, heliostat, axis_1, axis_2.
     within_s
@@ -77,7 +80,7 @@ def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) 
     # a result's reader takes longer to load than a PAINT directory to read
     from rfpose.multilat import PoseStatus
     from rfpose.pipeline.result import frame_time
-    from rfpose.pipeline.result_file import read_result
+    from rfpose.pipeline.result_file import open_result
 
     log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for row in _rows(motors, ("time_utc", "heliostat", "axis_1", "axis_2")):
@@ -85,19 +88,20 @@ def read_radio(results: Sequence[Path], motors: Path, *, within_s: float = 1.0) 
     table = {name: np.array(sorted(entries)) for name, entries in log.items()}
     kept: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     left_out = {}
-    for path in results:
-        result = read_result(path)
+    for i_result, given in enumerate(results):
+        result = open_result(given) if isinstance(given, str | Path) else given
+        source = Path(given).name if isinstance(given, str | Path) else f"result {i_result}"
         for i, start in enumerate(result.frame_start_index):
             length = result.scenario.radio.frame_samples / result.scenario.radio.sample_rate_hz
             unix_s = frame_time(int(start), result.sample_rate).timestamp() + 0.5 * length
             for h, name in enumerate(result.scenario.heliostat_ids):
                 status = PoseStatus(int(result.poses.status[i, h]))
                 if not np.isfinite(result.poses.normal_enu[i, h]).all():
-                    left_out[f"{path.name} frame {i} {name}"] = status.reason
+                    left_out[f"{source} frame {i} {name}"] = status.reason
                     continue
                 entry = _nearest(table.get(name), unix_s, within_s)
                 if entry is None:
-                    left_out[f"{path.name} frame {i} {name}"] = f"no motor position within {within_s:g} s"
+                    left_out[f"{source} frame {i} {name}"] = f"no motor position within {within_s:g} s"
                     continue
                 sigma = max(float(result.poses.sigma_rad[i, h]) / math.sqrt(2.0), 1e-7)
                 kept[name].append((unix_s, entry[1], entry[2], *result.poses.normal_enu[i, h], sigma))

@@ -134,6 +134,6 @@ def _check_filter(scenario: Scenario, choice: PoseChoice) -> None:
     if choice.filtered and learning:
         raise ScenarioError(
             f"heliostat `{learning[0]}` learns its receivers' delays over frames, and what they are off by is common "
-            "to the frames: a filter would claim more than it knows; leave the filter off (`--no-filter`), or leave "
+            "to the frames: a filter would claim more than it knows; leave the filter off (`filtered=False`), or leave "
             "`receiver_delay_drift_s_per_sqrt_min` away"
         )

@@ -122,17 +122,17 @@ def _run(
     tell: Callable[[str], None],
 ) -> tuple[Evaluation, Evaluation]:
     """Make all but the report; return the evaluations of all phases at once and of each receiver alone."""
+    from rfpose.drawing import save_figure
     from rfpose.pipeline.evaluate import evaluate
-    from rfpose.pipeline.pictures import draw_field_map, draw_spectrum
     from rfpose.pipeline.process import process
     from rfpose.pipeline.result_summary import write_poses_csv
-    from rfpose.pipeline.simulate import simulate_recording
+    from rfpose.pipeline.simulate import simulate
     from rfpose.pipeline.solve import solve
     from rfpose.recording import open_recording
 
     files = {what: place / name for what, name in _FILES.items()}
     tell(STAGES[0])
-    simulate_recording(scenario_path, files["recording"], seed=seed, on_progress=on_progress)
+    simulate(scenario_path, seed=seed).save(files["recording"], on_progress=on_progress)
     tell(STAGES[1])
     result = process(files["recording"], files["result"], on_progress=on_progress)
     tell(STAGES[2])
@@ -140,7 +140,7 @@ def _run(
     settings = {**result.settings, "pose": "independent"}
     independent = evaluate(solve(result.tones, result.scenario, settings=settings, truth=result.truth))
     write_poses_csv(result, files["poses"])
-    draw_field_map(result, files["field_map"], evaluation=evaluation)
+    save_figure(result.plot(evaluation=evaluation), files["field_map"])
     with open_recording(files["recording"]) as recording:
-        draw_spectrum(recording, files["spectrum"])
+        save_figure(recording.plot(), files["spectrum"])
     return evaluation, independent

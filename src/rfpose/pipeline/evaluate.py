@@ -20,11 +20,13 @@ from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import is_result, read_result
+from rfpose.pipeline.result_file import is_result, open_result
 from rfpose.pipeline.result_summary import EXPLAINED, count_reasons
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
+from rfpose.shown import Shown, number
+from rfpose.tables import Tabled
 from rfpose.truth import Truth
 
 __all__ = ["Evaluation", "FilteredErrors", "HeliostatRow", "Protection", "Statistics", "evaluate", "read_truth"]
@@ -133,8 +135,8 @@ class FilteredErrors:
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Evaluation:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Evaluation(Shown, Tabled):
     """Errors of a result against the truth; a milliradian here is of the mirror normal.
 
     Attributes
@@ -180,6 +182,31 @@ class Evaluation:
     bound_rad: FloatArray
     protection: Protection | None = None
     filtered: FilteredErrors | None = None
+
+    def headline(self) -> str:
+        """Return how far off, and what noise allows."""
+        return (
+            f"{number(self.normal_error_mrad.rms)} mrad of the normal, rms; bound {number(self.bound_mrad)}; "
+            f"{self.solved} mirror-frames solved, {self.failed} failed"
+        )
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return one row a heliostat [mrad of the normal]."""
+        rows = [
+            [row.id, str(row.solved), str(row.failed), *(number(value) for value in values)]
+            for row in self.heliostats
+            for values in [(row.normal_error_mrad.rms, row.normal_error_mrad.max, row.bound_mrad)]
+        ]
+        return ["", "solved", "failed", "rms", "worst", "bound"], rows
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a heliostat: errors, bound and reported sigma [mrad of the normal]."""
+        names = ("rms", "median", "p95", "max")
+        header = ["heliostat", "solved", "failed", *(f"normal_{k}_mrad" for k in names), "bound_mrad", "sigma_mrad"]
+        return header, [
+            [h.id, h.solved, h.failed, *h.normal_error_mrad.as_dict().values(), h.bound_mrad, h.sigma_mrad]
+            for h in self.heliostats
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``rfpose evaluate --json`` prints; its keys are a contract."""
@@ -229,7 +256,7 @@ def read_truth(path: str | Path, scenario: Scenario, *, follow_links: bool = Fal
     if path.suffix == ".json":
         return _truth_from_json(path, scenario)
     if is_result(path):
-        truth = read_result(path).truth
+        truth = open_result(path).truth
     else:
         with open_recording(path, follow_links=follow_links) as recording:
             truth = recording.truth
@@ -293,7 +320,9 @@ def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
 # -- comparison ----------------------------------------------------------------------------------------------
 
 
-def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
+def evaluate(
+    result: Result | str | Path, truth: Truth | str | Path | None = None, *, follow_links: bool = False
+) -> Evaluation:
     """Compare a result with the truth and with the bound.
 
     The bound is that of the pose model in use, at the true geometry, with the noise of the receiver and that of the
@@ -303,18 +332,38 @@ def evaluate(result: Result, truth: Truth | None = None) -> Evaluation:
     Parameters
     ----------
     result
-        From `rfpose.pipeline.process.process` or `rfpose.pipeline.result_file.read_result`.
+        As `rfpose.process` gives it, or the file of one.
     truth
-        Rows as in ``result.scenario`` (see `read_truth`); without it what the result carries.
+        Rows as in ``result.scenario``, or a file, see `read_truth`; without it what the result carries.
+    follow_links
+        As for `rfpose.recording.open_recording`.
 
     Raises
     ------
     InvalidInputError
         No truth anywhere, or none for these frames.
+    RecordingError
+        A file cannot be read.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    >>> short = site.changed(
+    ...     heliostat=site.heliostat[:2], radio={"frame_samples": 40_000}, simulation={"frame_count": 2}
+    ... )
+    >>> found = rf.evaluate(rf.process(rf.simulate(short, seed=1)))
+    >>> found.solved, found.normal_error_mrad.rms < 1.0
+    (4, True)
     """
-    truth = result.truth if truth is None else truth
+    source = "the result" if isinstance(result, Result) else f"{result}:"
+    result = result if isinstance(result, Result) else open_result(result)
     if truth is None:
-        raise InvalidInputError("the result carries no truth; give one with --truth FILE (simulated recording or JSON)")
+        truth = result.truth
+    elif not isinstance(truth, Truth):
+        truth = read_truth(truth, result.scenario, follow_links=follow_links)
+    if truth is None:
+        raise InvalidInputError(f"{source} carries no truth; give `truth=FILE` (a simulated recording or JSON)")
     rows = truth_rows(truth, result.frame_start_index)
     if not np.any(rows >= 0):
         raise InvalidInputError("the truth is of another time: it has none of the result's frames")

@@ -44,7 +44,7 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
     if kind in readers:
         return {"kind": kind, "path": str(path), **readers[kind](path)}
     if kind == "truth":
-        raise RecordingError(f"{path}: a truth, which `rfpose evaluate --truth` takes; give it there with its result")
+        raise RecordingError(f"{path}: a truth, which `rfpose evaluate` takes; give it there beside its result")
     if kind == "scenario" or path.suffix == ".toml":
         return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
     with open_recording(path, follow_links=follow_links) as recording:
@@ -82,10 +82,10 @@ def _scenario(scenario: Scenario) -> dict[str, Any]:
 
 def _result(path: Path) -> dict[str, Any]:
     from rfpose.pipeline.result import frame_time
-    from rfpose.pipeline.result_file import read_result
+    from rfpose.pipeline.result_file import open_result
     from rfpose.pipeline.result_summary import summarise
 
-    result = read_result(path)
+    result = open_result(path)
     starts = result.frame_start_index
     times = [frame_time(int(starts[i]), result.sample_rate).isoformat() for i in (0, -1)] if len(starts) else [None] * 2
     summary = summarise(result)
@@ -105,9 +105,9 @@ def _result(path: Path) -> dict[str, Any]:
 
 
 def _track(path: Path) -> dict[str, Any]:
-    from rfpose.pipeline.track_file import read_track
+    from rfpose.pipeline.track_file import open_track
 
-    track = read_track(path)
+    track = open_track(path)
     times = [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[:: max(len(track.unix_s) - 1, 1)]]
     unscored = [name for name, method in track.methods.items() if method.summary["normal_mrad"]["rms"] is None]
     problems = [f"{name}: no error was scored; its mirrors were never on the receiver" for name in unscored]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -14,12 +14,12 @@ from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, RfposeError, ScenarioError
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.fields import radial_staggered, read_positions, with_field
+from rfpose.layout.fields import radial_staggered
 from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
 from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
 from rfpose.measurement import SCENARIO
 from rfpose.multilat import check_unambiguous
-from rfpose.scenario import Scenario, Transmitter, check_scenario
+from rfpose.scenario import Scenario, Transmitter, read_positions
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -130,7 +130,7 @@ def field_of(scenario: Scenario) -> FloatArray:
 
 
 def field_from_csv(path: str | Path) -> FloatArray:
-    """Return pivots (heliostat, xyz) from a table; see `rfpose.layout.fields.read_positions`."""
+    """Return pivots (heliostat, xyz) from a table; see `rfpose.scenario.read_positions`."""
     return read_positions(path)[1]
 
 
@@ -196,7 +196,7 @@ class LiveLayout:
     def __init__(self, scenario: Scenario, choice: LayoutChoice, *, pivot_enu_m: FloatArray | None = None) -> None:
         self.choice = choice
         if pivot_enu_m is not None:
-            scenario = _with_field(scenario, pivot_enu_m)
+            scenario = scenario.with_field(pivot_enu_m)
         self._heliostats = scenario.heliostat
         self._posture = maps.posture_name(scenario) if choice.posture == "scenario" else choice.posture
         self._speed_mps = scenario.radio.propagation_speed_mps
@@ -220,7 +220,7 @@ class LiveLayout:
         if self._field is None:
             return self._nothing(cost, "the field has no heliostats; add some to the scenario, or load a field")
         try:
-            site = _with_transmitters(self._bare, transmitters)
+            site = self._bare.with_transmitters(transmitters)
             maps.check_site(site.transmitter_enu_m)
             check_unambiguous(site.transmitter_enu_m, site.wavelength_m)
             study = maps.study_of(site, self.choice.estimator, heliostats=self._heliostats)
@@ -258,23 +258,10 @@ class LiveLayout:
         )
 
 
-def _bare(scenario: Scenario, tones: Sequence[int]) -> dict[str, Any]:
-    """Return the scenario as data, without heliostats: quick to check after each move."""
-    data = scenario.model_dump(exclude_none=True)
-    data["heliostat"] = ()
-    data.get("simulation", {}).pop("blocked", None)
-    data.get("simulation", {}).pop("dropped", None)
-    if tones:
-        data["tone"] = tuple(data["tone"][i] for i in tones)
-    return data
-
-
-def _with_transmitters(bare: dict[str, Any], transmitters: Sequence[Transmitter]) -> Scenario:
-    return check_scenario({**bare, "transmitter": [t.model_dump() for t in transmitters]})
-
-
-def _with_field(scenario: Scenario, pivot_enu_m: FloatArray) -> Scenario:
-    return with_field(scenario, [f"H{k + 1}" for k in range(len(pivot_enu_m))], pivot_enu_m)
+def _bare(scenario: Scenario, tones: Sequence[int]) -> Scenario:
+    """Return the scenario without heliostats: quick to check after each move."""
+    kept = tuple(scenario.tone[i] for i in tones) or scenario.tone
+    return scenario.changed(heliostat=(), tone=kept, simulation={"blocked": None, "dropped": None})
 
 
 def _mirrors(scenario: Scenario, choice: LayoutChoice) -> Mirrors:
@@ -331,13 +318,8 @@ def scenario_of_layout(
         The layout contradicts itself; the message points to the key.
     """
     if pivot_enu_m is not None:
-        scenario = _with_field(scenario, pivot_enu_m)
-    data = scenario.model_dump(exclude_none=True)
-    kept = {t.id for t in transmitters}
-    simulation = data.get("simulation", {})
-    if simulation.get("blocked"):
-        simulation["blocked"] = [b for b in simulation["blocked"] if b["transmitter"] in kept]
-    return _with_transmitters(data, transmitters)
+        scenario = scenario.with_field(pivot_enu_m)
+    return scenario.with_transmitters(transmitters)
 
 
 def place_transmitters(

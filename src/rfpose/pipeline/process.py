@@ -1,7 +1,8 @@
-"""The main job: a recording in, a result file out; resumable, and nothing half written."""
+"""The main job: a recording in, a result out; into a file resumable, and nothing half written."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from rfpose.files import claim
 from rfpose.pipeline._journal import Journal
 from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
 from rfpose.recording.members import members
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import Scenario, scenario_of
 
 if TYPE_CHECKING:
     from rfpose.pipeline.choice import PoseChoice
@@ -28,10 +29,10 @@ _log = logging.getLogger(__name__)
 
 
 def process(
-    recording_path: str | Path,
-    result_path: str | Path,
+    recording: Recording | str | Path,
+    output: str | Path | None = None,
     *,
-    scenario_path: str | Path | None = None,
+    scenario: Scenario | str | Path | None = None,
     estimator: str = "hilbert",
     pose: str = "rigid",
     reflection: str | None = None,
@@ -42,19 +43,19 @@ def process(
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,
 ) -> Result:
-    """Find receiver positions and mirror normals in a recording and write them to a file.
+    """Find receiver positions and mirror normals in a recording.
 
-    Measured tone phases are kept in the directory ``RESULT.partial`` until the result is written. After an
-    interruption the same call goes on from there and gives the same bytes as an undisturbed one.
+    With ``output``, measured tone phases are kept in the directory ``OUTPUT.partial`` until the result is written.
+    After an interruption the same call goes on from there and gives the same bytes as an undisturbed one.
 
     Parameters
     ----------
-    recording_path
-        Whatever `rfpose.recording.open_recording` opens.
-    result_path
-        File to write, format ``rfpose-result``.
-    scenario_path
-        Site description; wins over the one in the recording.
+    recording
+        Open, or whatever `rfpose.recording.open_recording` opens.
+    output
+        File to write, format ``rfpose-result``; None: none, see `Result.save`.
+    scenario
+        The site, or its TOML file; wins over the one in the recording.
     estimator
         How tone phases are measured, one of `rfpose.dsp.ESTIMATORS`.
     pose
@@ -84,16 +85,29 @@ def process(
         The site admits no solution, or an ambiguous one.
     InvalidInputError
         Unknown ``estimator``, ``pose`` or ``reflection``, or a choice that the pose cannot follow.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    >>> short = site.changed(
+    ...     heliostat=site.heliostat[:2], radio={"frame_samples": 40_000}, simulation={"frame_count": 2}
+    ... )
+    >>> result = rf.process(rf.simulate(short, seed=1))
+    >>> result
+    <Result 'Table 2, 100 m field': 2 frames, 2 heliostats, 4 of 4 poses solved>
+    >>> result.poses.normal_enu.shape
+    (2, 2, 3)
     """
-    recording_path, result_path = Path(recording_path), Path(result_path)
-    kept = result_path.with_name(f"{result_path.name}.partial")
-    inputs = [recording_path, *members(recording_path), scenario_path, kept]
-    with claim(result_path, inputs=inputs, force=force) as job:
-        given = None if scenario_path is None else load_scenario(scenario_path)
-        with open_recording(recording_path, follow_links=follow_links) as recording:
-            scenario = _choose_scenario(recording, given)
-            check_against(recording, scenario)
-            starts = _frames(recording, scenario)
+    kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
+    read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
+    scenario_file = None if isinstance(scenario, Scenario) else scenario
+    with claim(output, inputs=[*read, scenario_file, kept], force=force) as job:
+        given = None if scenario is None else scenario_of(scenario)
+        with _opened(recording, follow_links=follow_links) as opened:
+            site = _choose_scenario(opened, given)
+            check_against(opened, site)
+            starts = _frames(opened, site)
             # compiled code, which none of the refusals above should wait for
             from rfpose.dsp import ESTIMATORS
             from rfpose.pipeline.choice import choose
@@ -104,24 +118,30 @@ def process(
 
             if estimator not in ESTIMATORS:
                 raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-            choice = choose(scenario, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
-            check_solvable(scenario, pose=pose, choice=choice)
-            _note_differing_receivers(recording, scenario)
-            note_doubts(recording)
-            key = journal_key(recording, scenario, estimator)
-            journal = Journal(kept, key, restart=force, resume=resume)
-            tones = measure_tones(
-                recording, scenario, starts, estimator=estimator, journal=journal, on_progress=on_progress
-            )
+            choice = choose(site, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
+            check_solvable(site, pose=pose, choice=choice)
+            _note_differing_receivers(opened, site)
+            note_doubts(opened)
+            journal = None
+            if kept is not None:
+                journal = Journal(kept, journal_key(opened, site, estimator), restart=force, resume=resume)
+            tones = measure_tones(opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress)
             asked = {"reflection": reflection, "integrity": integrity, "filter": filtered}
-            settings = _settings(
-                recording, scenario, choice, estimator=estimator, asked=asked, scenario_path=scenario_path
-            )
-            truth = None if recording.truth is None else align_truth(recording.truth, scenario)
-        result = solve(tones, scenario, settings=settings, truth=truth)
-        write_result(result, result_path)
-        job.afterwards(journal.remove)
+            settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
+            truth = None if opened.truth is None else align_truth(opened.truth, site)
+        result = solve(tones, site, settings=settings, truth=truth)
+        if output is not None:
+            write_result(result, output)
+        if journal is not None:
+            job.afterwards(journal.remove)
         return result
+
+
+def _opened(recording: Recording | str | Path, *, follow_links: bool) -> contextlib.AbstractContextManager[Recording]:
+    """Open a recording for the block; one that the caller opened stays open."""
+    if isinstance(recording, Recording):
+        return contextlib.nullcontext(recording)
+    return open_recording(recording, follow_links=follow_links)
 
 
 def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:
@@ -129,7 +149,7 @@ def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:
     if given is None:
         if embedded is None:
             raise ScenarioError(
-                f"{recording.path}: holds no scenario; describe the site in TOML and give --scenario FILE"
+                f"{recording.path}: holds no scenario; describe the site in TOML and give `scenario=FILE`"
             )
         return embedded
     if embedded is not None and embedded != given:
@@ -168,12 +188,12 @@ def _settings(
     *,
     estimator: str,
     asked: Mapping[str, object],
-    scenario_path: str | Path | None,
+    given: Scenario | str | Path | None,
 ) -> dict[str, str]:
     """Return what the result depends on, without places and times: equal work gives equal bytes."""
     command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {choice.pose}"
-    if scenario_path is not None:
-        command += f" --scenario {Path(scenario_path).name}"
+    if isinstance(given, str | Path):
+        command += f" --scenario {Path(given).name}"
     if asked["reflection"] is not None:
         command += f" --reflection {asked['reflection']}"
     if asked["integrity"] is not None:
@@ -189,7 +209,7 @@ def _settings(
         "recording": recording.path.name,
         "recording_format": recording.format,
         "sample_rate": str(recording.sample_rate),
-        "scenario_from": "recording" if scenario_path is None else "file",
+        "scenario_from": "recording" if given is None else "caller" if isinstance(given, Scenario) else "file",
         "estimator": estimator,
         **choice.as_settings(),
         "delays": "learned" if learns else "as the scenario says",

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,16 @@ from rfpose.errors import InvalidInputError
 from rfpose.foreign import exact_number
 from rfpose.multilat import RangeDifferences
 from rfpose.scenario import Scenario
+from rfpose.shown import Shown, counted, number
+from rfpose.tables import data_frame
 from rfpose.truth import Truth
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from rfpose.pipeline.evaluate import Evaluation
 
 __all__ = [
     "LAST_TIME_S",
@@ -210,8 +221,8 @@ class FilteredTable:
     status: StatusArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Result:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Result(Shown):
     """All that processing a recording found.
 
     Attributes
@@ -248,6 +259,92 @@ class Result:
     def sample_rate(self) -> Fraction:
         """Nominal sample rate [1/s]."""
         return rate_of(self.settings)
+
+    def headline(self) -> str:
+        """Return of what, how much, and how many poses were solved."""
+        status = self.poses.status
+        counts = f"{counted(len(status), 'frame')}, {counted(len(self.scenario.heliostat_ids), 'heliostat')}"
+        return f"{self.scenario.name!r}: {counts}, {np.count_nonzero(status == 0)} of {status.size} poses solved"
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return one row a heliostat: frames solved, and how well its normal is known."""
+        mrad, good = 1e3 * self.poses.sigma_rad, self.poses.status == 0
+        rows = []
+        for i, name in enumerate(self.scenario.heliostat_ids):
+            kept = mrad[good[:, i], i]
+            sigma = float(np.sqrt(np.mean(kept**2))) if kept.size else None
+            rows.append([name, f"{kept.size} of {len(mrad)}", number(sigma)])
+        return ["heliostat", "frames solved", "sigma of the normal, rms [mrad]"], rows
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts of what was solved and what was not, with reasons, as ``rfpose process --json`` prints them."""
+        from rfpose.pipeline.result_summary import summarise
+
+        return summarise(self)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the result, format ``rfpose-result``.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite what exists.
+
+        Raises
+        ------
+        RecordingError
+            The file exists, or cannot be written; what stood under ``path`` is untouched.
+        """
+        from rfpose.pipeline.result_file import write_result
+
+        write_result(self, path, force=force)
+
+    def to_pandas(self, what: Literal["poses", "fixes"] = "poses") -> pd.DataFrame:
+        """Return mirror normals, or places of receivers each located on its own, one row a frame; needs pandas.
+
+        Raises
+        ------
+        InvalidInputError
+            pandas is not installed; ``what`` is something else.
+        """
+        from rfpose.pipeline.result_summary import fix_table, pose_table
+
+        tables = {"poses": pose_table, "fixes": fix_table}
+        if what not in tables:
+            raise InvalidInputError(f"`what` must be one of {', '.join(tables)}, got {what!r}")
+        return data_frame(*tables[what](self))
+
+    def to_xarray(self, group: str | None = None) -> xr.Dataset:
+        """Return the arrays with labelled dimensions: frame time, receiver, heliostat, transmitter, tone; needs xarray.
+
+        Units and meanings are attributes, and a status has its codes as CF has them: ``flag_values`` and
+        ``flag_meanings``.
+
+        Parameters
+        ----------
+        group
+            One group of the result file, ``"poses"`` for one, with its names; None: everything, named as
+            ``poses_normal_enu``.
+
+        Raises
+        ------
+        InvalidInputError
+            xarray is not installed; the result has no such group.
+        """
+        from rfpose.pipeline.result_file import dataset
+
+        return dataset(self, group)
+
+    def plot(self, *, evaluation: Evaluation | None = None) -> Figure:
+        """Draw the field from above: transmitters, heliostats, their normals, and how well these are known.
+
+        With ``evaluation`` a mirror's colour is its error instead of the sigma that the result reports.
+        """
+        from rfpose.pipeline.pictures import draw_field_map
+
+        return draw_field_map(self, evaluation=evaluation)
 
 
 LAST_TIME_S = 253_402_300_799

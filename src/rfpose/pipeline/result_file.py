@@ -1,17 +1,15 @@
 """The file of a result: format ``rfpose-result``, HDF5, described in ``docs/result-format.md``.
 
-Every name in the file stands in `KEYS`, with axes, unit and meaning; writer and reader both follow it.
+Every name in the file stands in `KEYS`, with dimensions, unit and meaning; writer, reader and Dataset follow it.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
-from enum import IntEnum
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -19,13 +17,25 @@ import numpy.typing as npt
 
 from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
-from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError, ScenarioError
 from rfpose.files import write_atomically
 from rfpose.kinds import check_kind, kind_of
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.columns import (
+    ENU,
+    FIXED,
+    Column,
+    ColumnWriter,
+    Labels,
+    dataset_of,
+    seconds_since,
+    text_label,
+    write_names,
+)
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
 from rfpose.pipeline.result import (
     LAST_TIME_S,
@@ -42,14 +52,19 @@ from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 __all__ = [
     "FORMAT",
     "KEYS",
     "OPTIONAL",
     "VERSION",
-    "Key",
+    "columns_of",
+    "dataset",
     "is_result",
-    "read_result",
+    "labels_of",
+    "open_result",
     "write_result",
 ]
 
@@ -60,92 +75,96 @@ VERSION = 1
 # -- the names in the file -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class Key:
-    """One dataset: its axes (a number is a fixed length), numpy type, unit and meaning."""
-
-    axes: tuple[str | int, ...]
-    dtype: str
-    unit: str
-    meaning: str
-
-
 _FR = ("frame", "receiver")
 _FRT = (*_FR, "transmitter")
 _FRTQ = (*_FRT, "tone")
 _FTQ = ("frame", "transmitter", "tone")
 _FH = ("frame", "heliostat")
 
-KEYS: Mapping[str, Key] = {
-    "frames/start_index": Key(("frame",), "i8", "sample", "first sample since the Unix epoch at the nominal rate"),
-    "tones/phase_rad": Key(_FRTQ, "f8", "rad", "tone phase, not yet calibrated"),
-    "tones/sigma_rad": Key(_FRTQ, "f8", "rad", "its standard deviation"),
-    "tones/carrier": Key(_FRT, "c16", "counts", "complex amplitude of the carrier"),
-    "tones/carrier_sigma": Key(_FRT, "f8", "counts", "standard deviation of its real and imaginary part"),
-    "tones/sideband": Key((*_FRTQ, 2), "c16", "counts", "complex amplitude of upper and lower sideband"),
-    "tones/sideband_sigma": Key((*_FRTQ, 2), "f8", "counts", "standard deviation of real and imaginary part"),
-    "tones/clock_ppm": Key(_FR, "f8", "1e-6", "offset of the receiver's clock"),
-    "tones/clock_sigma_ppm": Key(_FR, "f8", "1e-6", "its standard deviation"),
-    "tones/noise_variance": Key(_FR, "f8", "counts2", "variance of the complex noise in the band"),
-    "tones/clipped_fraction": Key(_FR, "f8", "1", "part of the samples at full scale"),
-    "tones/status": Key(_FRT, "u1", "code", "what is wrong with the line, 0 nothing"),
-    "calibration/phase_rad": Key(_FTQ, "f8", "rad", "electronic phase of the transmitter's tone"),
-    "calibration/sigma_rad": Key(_FTQ, "f8", "rad", "its standard deviation"),
-    "calibration/drift_rad_per_sqrt_s": Key(("tone",), "f8", "rad/s^0.5", "random-walk rate seen between frames"),
-    "calibration/status": Key(("frame", "transmitter"), "u1", "code", "where it comes from, 0 measured in this frame"),
-    "ranges/range_difference_m": Key(_FRT, "f8", "m", "range less that to the reference, up to one constant a row"),
-    "ranges/sigma_m": Key(_FRT, "f8", "m", "standard deviation of ONE transmitter's range, receiver noise"),
-    "ranges/calibration_sigma_m": Key(_FRT, "f8", "m", "the same from calibration, common to a frame's receivers"),
-    "ranges/reference": Key(_FR, "i8", "index", "reference transmitter, -1 none"),
-    "ranges/status": Key(_FRT, "i1", "code", "why a range is missing or poorer, 0 measured with every tone"),
-    "fixes/position_enu_m": Key((*_FR, 3), "f8", "m", "receiver position, east, north, up"),
-    "fixes/cov_enu_m2": Key((*_FR, 3, 3), "f8", "m2", "its covariance"),
-    "fixes/clock_m": Key(_FR, "f8", "m", "range to the reference transmitter"),
-    "fixes/dop": Key(_FR, "f8", "1", "position RMS over the deviation of one range"),
-    "fixes/residual_m": Key(_FRT, "f8", "m", "computed less measured range"),
-    "fixes/chi2": Key(_FR, "f8", "1", "sum of squared residuals over variances"),
-    "fixes/n_transmitter": Key(_FR, "i2", "1", "transmitters used"),
-    "fixes/n_iteration": Key(_FR, "i2", "1", "Gauss-Newton steps"),
-    "fixes/status": Key(_FR, "i1", "code", "why a fix is missing, 0 solved"),
-    "poses/normal_enu": Key((*_FH, 3), "f8", "1", "mirror normal, unit length, east, north, up"),
-    "poses/cov_enu": Key((*_FH, 3, 3), "f8", "rad2", "its covariance"),
-    "poses/sigma_rad": Key(_FH, "f8", "rad", "RMS angle of the normal's error, both axes together"),
-    "poses/azimuth_rad": Key(_FH, "f8", "rad", "azimuth of the normal, from north, clockwise"),
-    "poses/elevation_rad": Key(_FH, "f8", "rad", "elevation of the normal"),
-    "poses/centre_enu_m": Key((*_FH, 3), "f8", "m", "mean position of the located receivers"),
-    "poses/n_receiver": Key(_FH, "i2", "1", "receivers used"),
-    "poses/n_wavelength": Key(_FH, "i2", "1", "wavelengths (tones, carrier) with resolved integers; 0: independent"),
-    "poses/integer_risk": Key(_FH, "f8", "1", "largest probability of a wrong integer beforehand"),
-    "poses/integer_method": Key((*_FH, "clock"), "i1", "code", "how its whole wavelengths were found, 0 left out"),
-    "poses/status": Key(_FH, "i1", "code", "why a pose is missing, 0 solved"),
-    "integrity/status": Key(_FH, "i1", "code", "what tests of the residuals say, 0 consistent"),
-    "integrity/transmitter_status": Key((*_FH, "transmitter"), "i1", "code", "what was left out and why, 0 used"),
-    "integrity/used": Key(_FRT, "?", "1", "whether any of its phases is in the pose"),
-    "integrity/prior_rejected": Key((*_FH, 3), "?", "1", "pivot, mount, clocks: contradicts the data, left out"),
-    "integrity/prior_testable": Key((*_FH, 3), "?", "1", "pivot, mount, clocks: the data could contradict it"),
-    "integrity/probability_all": Key(_FH, "f8", "1", "of residuals so large by chance, with everything"),
-    "integrity/probability": Key(_FH, "f8", "1", "of residuals so large by chance, with what was used"),
-    "integrity/protection_level_rad": Key(_FH, "f8", "rad", "what the normal's error does not exceed unnoticed"),
-    "integrity/worst_transmitter": Key(_FH, "i2", "index", "transmitter that sets the protection level, -1 none"),
-    "reflection/coefficient": Key((*_FH, "reflector"), "c16", "1", "reflection coefficient; the ground first"),
-    "reflection/coefficient_sigma": Key((*_FH, "reflector", 2), "f8", "1", "of real and imaginary part; 0 given"),
-    "reflection/probability_direct": Key(_FH, "f8", "1", "of residuals so large by chance, with the direct ray alone"),
-    "delays/delay_s": Key((*_FR, "clock"), "f8", "s", "delay less that of the mirror's first receiver"),
-    "delays/sigma_s": Key((*_FR, "clock"), "f8", "s", "its standard deviation"),
-    "delays/jumped": Key(_FH, "?", "1", "a delay had jumped and was learned anew"),
-    "filtered/normal_enu": Key((*_FH, 3), "f8", "1", "filtered mirror normal, unit length, east, north, up"),
-    "filtered/cov_enu": Key((*_FH, 3, 3), "f8", "rad2", "its covariance"),
-    "filtered/sigma_rad": Key(_FH, "f8", "rad", "RMS angle of its error, both axes together"),
-    "filtered/pivot_enu_m": Key((*_FH, 3), "f8", "m", "filtered pivot, east, north, up"),
-    "filtered/rate_enu_radps": Key((*_FH, 3), "f8", "rad/s", "turning rate, about east, north, up"),
-    "filtered/status": Key(_FH, "i1", "code", "what became of the frame, 1 measured and taken in"),
-    "truth/frame_start_index": Key(("truth_frame",), "i8", "sample", "frames of the truth"),
-    "truth/normal_enu": Key(("truth_frame", "heliostat", 3), "f8", "1", "true mirror normal"),
-    "truth/receiver_enu_m": Key(("truth_frame", "receiver", 3), "f8", "m", "true receiver position"),
-    "truth/transmitter_phase_rad": Key(("truth_frame", "transmitter", "tone"), "f8", "rad", "true electronic phase"),
-    "truth/clock_ppm": Key(("receiver",), "f8", "1e-6", "true clock offset"),
-    "truth/receiver_delay_s": Key(("truth_frame", "receiver"), "f8", "s", "true hardware delay"),
-    "truth/tone_snr": Key(("truth_frame", "receiver", "transmitter", "tone"), "f8", "1", "true SNR per sample"),
+KEYS: Mapping[str, Column] = {
+    "frames/start_index": Column(("frame",), "i8", "sample", "first sample since the Unix epoch at the nominal rate"),
+    "tones/phase_rad": Column(_FRTQ, "f8", "rad", "tone phase, not yet calibrated"),
+    "tones/sigma_rad": Column(_FRTQ, "f8", "rad", "its standard deviation"),
+    "tones/carrier": Column(_FRT, "c16", "counts", "complex amplitude of the carrier"),
+    "tones/carrier_sigma": Column(_FRT, "f8", "counts", "standard deviation of its real and imaginary part"),
+    "tones/sideband": Column((*_FRTQ, "side"), "c16", "counts", "complex amplitude of upper and lower sideband"),
+    "tones/sideband_sigma": Column((*_FRTQ, "side"), "f8", "counts", "standard deviation of real and imaginary part"),
+    "tones/clock_ppm": Column(_FR, "f8", "1e-6", "offset of the receiver's clock"),
+    "tones/clock_sigma_ppm": Column(_FR, "f8", "1e-6", "its standard deviation"),
+    "tones/noise_variance": Column(_FR, "f8", "counts2", "variance of the complex noise in the band"),
+    "tones/clipped_fraction": Column(_FR, "f8", "1", "part of the samples at full scale"),
+    "tones/status": Column(_FRT, "u1", "code", "what is wrong with the line, 0 nothing", LineStatus),
+    "calibration/phase_rad": Column(_FTQ, "f8", "rad", "electronic phase of the transmitter's tone"),
+    "calibration/sigma_rad": Column(_FTQ, "f8", "rad", "its standard deviation"),
+    "calibration/drift_rad_per_sqrt_s": Column(("tone",), "f8", "rad/s^0.5", "random-walk rate seen between frames"),
+    "calibration/status": Column(
+        ("frame", "transmitter"), "u1", "code", "where it comes from, 0 measured in this frame", CalibrationStatus
+    ),
+    "ranges/range_difference_m": Column(_FRT, "f8", "m", "range less that to the reference, up to one constant a row"),
+    "ranges/sigma_m": Column(_FRT, "f8", "m", "standard deviation of ONE transmitter's range, receiver noise"),
+    "ranges/calibration_sigma_m": Column(_FRT, "f8", "m", "the same from calibration, common to a frame's receivers"),
+    "ranges/reference": Column(_FR, "i8", "index", "reference transmitter, -1 none"),
+    "ranges/status": Column(
+        _FRT, "i1", "code", "why a range is missing or poorer, 0 measured with every tone", RangeStatus
+    ),
+    "fixes/position_enu_m": Column((*_FR, "xyz"), "f8", "m", "receiver position, east, north, up"),
+    "fixes/cov_enu_m2": Column((*_FR, "xyz", "xyz_other"), "f8", "m2", "its covariance"),
+    "fixes/clock_m": Column(_FR, "f8", "m", "range to the reference transmitter"),
+    "fixes/dop": Column(_FR, "f8", "1", "position RMS over the deviation of one range"),
+    "fixes/residual_m": Column(_FRT, "f8", "m", "computed less measured range"),
+    "fixes/chi2": Column(_FR, "f8", "1", "sum of squared residuals over variances"),
+    "fixes/n_transmitter": Column(_FR, "i2", "1", "transmitters used"),
+    "fixes/n_iteration": Column(_FR, "i2", "1", "Gauss-Newton steps"),
+    "fixes/status": Column(_FR, "i1", "code", "why a fix is missing, 0 solved", FixStatus),
+    "poses/normal_enu": Column((*_FH, "xyz"), "f8", "1", "mirror normal, unit length, east, north, up"),
+    "poses/cov_enu": Column((*_FH, "xyz", "xyz_other"), "f8", "rad2", "its covariance"),
+    "poses/sigma_rad": Column(_FH, "f8", "rad", "RMS angle of the normal's error, both axes together"),
+    "poses/azimuth_rad": Column(_FH, "f8", "rad", "azimuth of the normal, from north, clockwise"),
+    "poses/elevation_rad": Column(_FH, "f8", "rad", "elevation of the normal"),
+    "poses/centre_enu_m": Column((*_FH, "xyz"), "f8", "m", "mean position of the located receivers"),
+    "poses/n_receiver": Column(_FH, "i2", "1", "receivers used"),
+    "poses/n_wavelength": Column(_FH, "i2", "1", "wavelengths (tones, carrier) with resolved integers; 0: independent"),
+    "poses/integer_risk": Column(_FH, "f8", "1", "largest probability of a wrong integer beforehand"),
+    "poses/integer_method": Column(
+        (*_FH, "clock"), "i1", "code", "how its whole wavelengths were found, 0 left out", IntegerMethod
+    ),
+    "poses/status": Column(_FH, "i1", "code", "why a pose is missing, 0 solved", PoseStatus),
+    "integrity/status": Column(_FH, "i1", "code", "what tests of the residuals say, 0 consistent", IntegrityStatus),
+    "integrity/transmitter_status": Column(
+        (*_FH, "transmitter"), "i1", "code", "what was left out and why, 0 used", TransmitterStatus
+    ),
+    "integrity/used": Column(_FRT, "?", "1", "whether any of its phases is in the pose"),
+    "integrity/prior_rejected": Column(
+        (*_FH, "prior"), "?", "1", "pivot, mount, clocks: contradicts the data, left out"
+    ),
+    "integrity/prior_testable": Column((*_FH, "prior"), "?", "1", "pivot, mount, clocks: the data could contradict it"),
+    "integrity/probability_all": Column(_FH, "f8", "1", "of residuals so large by chance, with everything"),
+    "integrity/probability": Column(_FH, "f8", "1", "of residuals so large by chance, with what was used"),
+    "integrity/protection_level_rad": Column(_FH, "f8", "rad", "what the normal's error does not exceed unnoticed"),
+    "integrity/worst_transmitter": Column(_FH, "i2", "index", "transmitter that sets the protection level, -1 none"),
+    "reflection/coefficient": Column((*_FH, "reflector"), "c16", "1", "reflection coefficient; the ground first"),
+    "reflection/coefficient_sigma": Column(
+        (*_FH, "reflector", "part"), "f8", "1", "of real and imaginary part; 0 given"
+    ),
+    "reflection/probability_direct": Column(
+        _FH, "f8", "1", "of residuals so large by chance, with the direct ray alone"
+    ),
+    "delays/delay_s": Column((*_FR, "clock"), "f8", "s", "delay less that of the mirror's first receiver"),
+    "delays/sigma_s": Column((*_FR, "clock"), "f8", "s", "its standard deviation"),
+    "delays/jumped": Column(_FH, "?", "1", "a delay had jumped and was learned anew"),
+    "filtered/normal_enu": Column((*_FH, "xyz"), "f8", "1", "filtered mirror normal, unit length, east, north, up"),
+    "filtered/cov_enu": Column((*_FH, "xyz", "xyz_other"), "f8", "rad2", "its covariance"),
+    "filtered/sigma_rad": Column(_FH, "f8", "rad", "RMS angle of its error, both axes together"),
+    "filtered/pivot_enu_m": Column((*_FH, "xyz"), "f8", "m", "filtered pivot, east, north, up"),
+    "filtered/rate_enu_radps": Column((*_FH, "xyz"), "f8", "rad/s", "turning rate, about east, north, up"),
+    "filtered/status": Column(_FH, "i1", "code", "what became of the frame, 1 measured and taken in", TrackStatus),
+    "truth/frame_start_index": Column(("truth_frame",), "i8", "sample", "frames of the truth"),
+    "truth/normal_enu": Column(("truth_frame", "heliostat", "xyz"), "f8", "1", "true mirror normal"),
+    "truth/receiver_enu_m": Column(("truth_frame", "receiver", "xyz"), "f8", "m", "true receiver position"),
+    "truth/transmitter_phase_rad": Column(("truth_frame", "transmitter", "tone"), "f8", "rad", "true electronic phase"),
+    "truth/clock_ppm": Column(("receiver",), "f8", "1e-6", "true clock offset"),
+    "truth/receiver_delay_s": Column(("truth_frame", "receiver"), "f8", "s", "true hardware delay"),
+    "truth/tone_snr": Column(("truth_frame", "receiver", "transmitter", "tone"), "f8", "1", "true SNR per sample"),
 }
 """Datasets by path. Those under ``truth/`` may be absent, each on its own; those of `OPTIONAL` all together."""
 
@@ -157,19 +176,6 @@ OPTIONAL: Mapping[str, type[Any]] = {
 }
 """Groups that are there where the estimator of poses makes them."""
 
-_STATUS: Mapping[str, type[IntEnum]] = {
-    "tones/status": LineStatus,
-    "calibration/status": CalibrationStatus,
-    "ranges/status": RangeStatus,
-    "fixes/status": FixStatus,
-    "poses/integer_method": IntegerMethod,
-    "poses/status": PoseStatus,
-    "integrity/status": IntegrityStatus,
-    "integrity/transmitter_status": TransmitterStatus,
-    "filtered/status": TrackStatus,
-}
-
-
 _TRANSMITTER_INDEX = ("ranges/reference", "integrity/worst_transmitter")
 
 
@@ -180,8 +186,8 @@ def _group_keys(group: str) -> list[str]:
 # -- writing -------------------------------------------------------------------------------------------------
 
 
-def write_result(result: Result, path: str | Path) -> None:
-    """Write a result in one go; the same result gives the same bytes.
+def write_result(result: Result, path: str | Path, *, force: bool = True) -> None:
+    """Write a result in one go; the same result gives the same bytes. Without ``force`` nothing is replaced.
 
     Raises
     ------
@@ -197,35 +203,67 @@ def write_result(result: Result, path: str | Path) -> None:
         for name, text in sorted(result.settings.items()):
             settings.attrs[name] = text
         for name in ("receiver_ids", "transmitter_ids", "heliostat_ids"):
-            file.create_dataset(f"ids/{name}", data=np.array(getattr(result.scenario, name), dtype=object), dtype=_TEXT)
-        _write(file, "frames/start_index", result.frame_start_index)
-        for group in ("tones", "calibration", "ranges", "fixes", "poses"):
-            record = getattr(result, group)
-            for name in _group_keys(group):
-                _write(file, f"{group}/{name}", getattr(record, name))
-        for group in OPTIONAL:
-            record = getattr(result, group)
-            for name in _group_keys(group) if record is not None else ():
-                _write(file, f"{group}/{name}", getattr(record, name))
-        if result.truth is not None:
-            for name in _group_keys("truth"):
-                values = getattr(result.truth, name)
-                if values is not None:
-                    _write(file, f"truth/{name}", values)
-    write_atomically(path, image.getvalue())
+            write_names(file, f"ids/{name}", getattr(result.scenario, name))
+        writer = ColumnWriter(file, labels_of(result))
+        for place, (column, values) in columns_of(result).items():
+            writer.write(file, place, column, values)
+    write_atomically(path, image.getvalue(), force=force)
 
 
-_TEXT = h5py.string_dtype()
+def columns_of(result: Result) -> dict[str, tuple[Column, npt.NDArray[Any]]]:
+    """Return what a result has of `KEYS`, by path."""
+    found = {}
+    for path, column in KEYS.items():
+        group, _, name = path.partition("/")
+        record = {"start_index": result.frame_start_index} if group == "frames" else getattr(result, group)
+        values = record[name] if group == "frames" else None if record is None else getattr(record, name)
+        if values is not None:
+            found[path] = (column, values)
+    return found
 
 
-def _write(file: h5py.File, path: str, values: npt.ArrayLike) -> None:
-    key = KEYS[path]
-    dataset = file.create_dataset(path, data=np.asarray(values, dtype=key.dtype))
-    dataset.attrs["unit"] = key.unit
-    dataset.attrs["axes"] = ", ".join(str(axis) for axis in key.axes)
-    dataset.attrs["meaning"] = key.meaning
-    if path in _STATUS:
-        dataset.attrs["codes"] = "; ".join(f"{code.value} {code.reason}" for code in _STATUS[path])  # type: ignore[attr-defined]
+def dataset(result: Result, group: str | None) -> xr.Dataset:
+    """Return a result, or one group of it, as a labelled Dataset; see `Result.to_xarray`."""
+    columns = columns_of(result)
+    groups = list(dict.fromkeys(path.partition("/")[0] for path in columns))
+    if group is not None and group not in groups:
+        raise InvalidInputError(f"`group` must be one of {', '.join(groups)}, got {group!r}")
+    named = {
+        path.partition("/")[2] if group else path.replace("/", "_"): column
+        for path, column in columns.items()
+        if group in (None, path.partition("/")[0])
+    }
+    return dataset_of(named, labels_of(result), {"scenario": result.scenario.name, **result.settings})
+
+
+def labels_of(result: Result) -> Labels:
+    """Return what the entries along each dimension are called."""
+    scenario, truth = result.scenario, result.truth
+    clocks = [f"{1e-6 * f:.9g} MHz" for f in np.sort(scenario.tone_hz)] + ["carrier"]
+    truth_start = np.zeros(1, np.int64) if truth is None else truth.frame_start_index
+    n_truth = 0 if truth is None else len(truth.normal_enu)
+
+    def instants(starts: npt.NDArray[np.int64], meaning: str) -> tuple[npt.NDArray[Any], Mapping[str, str]]:
+        microseconds = [int(int(start) * 1_000_000 / result.sample_rate) for start in starts]
+        return seconds_since(np.array(microseconds, np.int64), "microseconds", meaning)
+
+    return {
+        "frame": instants(result.frame_start_index, "first sample of the frame, UTC"),
+        "receiver": text_label(scenario.receiver_ids, "receiver"),
+        "transmitter": text_label(scenario.transmitter_ids, "transmitter"),
+        "heliostat": text_label(scenario.heliostat_ids, "heliostat"),
+        "tone": (np.array(scenario.tone_hz), {"long_name": "frequency of the tone", "units": "Hz"}),
+        "xyz": text_label(ENU, "axis of the site's frame"),
+        "xyz_other": text_label(ENU, "axis of the site's frame"),
+        "side": text_label(("upper", "lower"), "side of the carrier"),
+        "part": text_label(("real", "imaginary"), "part of a complex number"),
+        "clock": text_label(clocks[: result.poses.integer_method.shape[-1]], "wavelength, the coarsest first"),
+        "prior": text_label(PRIORS, "what is known beforehand"),
+        "reflector": text_label(("ground", *(p.name for p in scenario.reflection.plane)), "what reflects"),
+        "truth_frame": (np.arange(n_truth), {"long_name": "frame of the truth"})
+        if truth_start is None
+        else instants(truth_start, "from when on the truth holds, UTC"),
+    }
 
 
 # -- reading -------------------------------------------------------------------------------------------------
@@ -236,7 +274,7 @@ def is_result(path: str | Path) -> bool:
     return kind_of(path) == "result"
 
 
-def read_result(path: str | Path) -> Result:
+def open_result(path: str | Path) -> Result:
     """Read a result.
 
     Raises
@@ -244,6 +282,11 @@ def read_result(path: str | Path) -> Result:
     RecordingError
         Missing, truncated, not HDF5, another format or version, or something in it is missing, of another type or
         shape, or says what no result says; the message names the file and the place.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> rf.open_result("result.h5").to_pandas()  # doctest: +SKIP
     """
     path = Path(path)
     check_kind(path, wanted="result")
@@ -264,14 +307,14 @@ class _Reader:
     def __init__(self, path: Path, file: h5py.File) -> None:
         self._path = path
         self._file = file
-        self._length: dict[str, int] = {}
+        self._length = dict(FIXED)
 
     def result(self) -> Result:
         version = self._file.attrs.get("version")
         if version != VERSION:
             raise self._error(f"has version {version} of {FORMAT}, this rfpose reads {VERSION}", "process again")
         scenario = self._scenario()
-        self._length = {
+        self._length |= {
             "receiver": len(scenario.receiver_ids),
             "transmitter": len(scenario.transmitter_ids),
             "tone": len(scenario.tone_hz),
@@ -363,16 +406,14 @@ class _Reader:
             raise self._error(f"`/{path}` is missing", "process again")
         if dataset.dtype.kind != np.dtype(key.dtype).kind:
             raise self._error(f"`/{path}` holds {dataset.dtype}, not {np.dtype(key.dtype)}", "process again")
-        expected = tuple(axis if isinstance(axis, int) else self._length.get(axis) for axis in key.axes)
+        expected = tuple(self._length.get(dim) for dim in key.dims)
         fits = len(expected) == dataset.ndim and all(
             want is None or want == got for want, got in zip(expected, dataset.shape, strict=True)
         )
         if not fits:
-            axes = ", ".join(str(axis) for axis in key.axes)
-            raise self._error(f"`/{path}` has shape {dataset.shape}, not ({axes})", "process again")
-        for axis, got in zip(key.axes, dataset.shape, strict=True):
-            if isinstance(axis, str):
-                self._length.setdefault(axis, got)
+            raise self._error(f"`/{path}` has shape {dataset.shape}, not ({', '.join(key.dims)})", "process again")
+        for dim, got in zip(key.dims, dataset.shape, strict=True):
+            self._length.setdefault(dim, got)
         try:
             values = array_of(self._file, f"/{path}", key.dtype)
         except RecordingError:
@@ -384,8 +425,9 @@ class _Reader:
 
     def _check_codes(self, path: str, values: npt.NDArray[Any]) -> None:
         """Refuse codes that mean nothing, and transmitters that do not exist."""
-        if path in _STATUS:
-            good = np.isin(values, [int(code) for code in _STATUS[path]])
+        codes = KEYS[path].codes
+        if codes is not None:
+            good = np.isin(values, [int(code) for code in codes])
         elif path in _TRANSMITTER_INDEX:
             good = (values >= -1) & (values < self._length["transmitter"])
         else:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
+from datetime import datetime
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import LineStatus
-from rfpose.files import write_atomically
 from rfpose.multilat import FixStatus, PoseStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
@@ -27,12 +25,15 @@ from rfpose.pipeline.result import (
     Result,
     frame_time,
 )
+from rfpose.tables import write_csv
 
 __all__ = [
     "CSV_COLUMNS",
     "EXPLAINED",
     "NEEDED_PROBABILITY",
     "count_reasons",
+    "fix_table",
+    "pose_table",
     "summarise",
     "write_poses_csv",
 ]
@@ -185,29 +186,51 @@ CSV_COLUMNS = (
 )
 
 
+_CSV_FORMATS = ("", "", "", ".6f", ".6f", ".9f", ".9f", ".9f", ".6f", "")
+
+
+def pose_table(result: Result) -> tuple[list[str], list[list[Any]]]:
+    """Return header and rows of the mirror normals for people: degrees, milliradians of the normal; by frame."""
+    poses, rows = result.poses, []
+    azimuth, elevation, mrad = np.degrees(poses.azimuth_rad), np.degrees(poses.elevation_rad), 1e3 * poses.sigma_rad
+    for i_frame, start in enumerate(result.frame_start_index):
+        time = frame_time(int(start), result.sample_rate)
+        for i, name in enumerate(result.scenario.heliostat_ids):
+            k = (i_frame, i)
+            status = PoseStatus(int(poses.status[k])).reason
+            rows.append([i_frame, time, name, azimuth[k], elevation[k], *poses.normal_enu[k], mrad[k], status])
+    return list(CSV_COLUMNS), rows
+
+
+def fix_table(result: Result) -> tuple[list[str], list[list[Any]]]:
+    """Return header and rows of the receivers' places, each located on its own [m]; by frame."""
+    fixes, scenario, rows = result.fixes, result.scenario, []
+    sigma_m = np.sqrt(np.trace(fixes.cov_enu_m2, axis1=-2, axis2=-1))
+    for i_frame, start in enumerate(result.frame_start_index):
+        time = frame_time(int(start), result.sample_rate)
+        for i, receiver in enumerate(scenario.receivers):
+            k = (i_frame, i)
+            owner = "" if receiver.heliostat is None else scenario.heliostat_ids[receiver.heliostat]
+            status = FixStatus(int(fixes.status[k])).reason
+            place = fixes.position_enu_m[k]
+            rows.append([i_frame, time, receiver.id, owner, *place, sigma_m[k], fixes.dop[k], status])
+    header = ["frame", "time_utc", "receiver", "heliostat", "east_m", "north_m", "up_m", "sigma_m", "dop", "status"]
+    return header, rows
+
+
 def write_poses_csv(result: Result, path: str | Path) -> None:
-    """Write the mirror normals for people: degrees, milliradians of the normal, one row a frame and heliostat.
+    """Write the mirror normals for people, as `pose_table` has them; numbers that are not known stay empty.
 
     Raises
     ------
     RecordingError
         The file cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(CSV_COLUMNS)
-    poses = result.poses
-    for i_frame, start in enumerate(result.frame_start_index):
-        time = frame_time(int(start), result.sample_rate).isoformat(timespec="microseconds")
-        for i, heliostat in enumerate(result.scenario.heliostat_ids):
-            row = (i_frame, i)
-            numbers = [
-                f"{np.degrees(poses.azimuth_rad[row]):.6f}",
-                f"{np.degrees(poses.elevation_rad[row]):.6f}",
-                *(f"{value:.9f}" for value in poses.normal_enu[row]),
-                f"{1e3 * poses.sigma_rad[row]:.6f}",
-            ]
-            blank = ["" if number == "nan" else number for number in numbers]
-            status = PoseStatus(int(poses.status[row])).reason
-            writer.writerow([i_frame, time.replace("+00:00", "Z"), heliostat, *blank, status])
-    write_atomically(path, text.getvalue().encode())
+
+    def cell(value: Any, form: str) -> Any:
+        if isinstance(value, datetime):
+            return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
+        return value if not form else f"{value:{form}}" if np.isfinite(value) else ""
+
+    header, rows = pose_table(result)
+    write_csv(path, header, [[cell(v, form) for v, form in zip(row, _CSV_FORMATS, strict=True)] for row in rows])

@@ -2,90 +2,142 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
 
 from rfpose import __version__
 from rfpose.files import claim
-from rfpose.recording import RecordingWriter
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.recording import Recording, RecordingWriter
+from rfpose.recording.base import IqArray
+from rfpose.scenario import Scenario, scenario_of
 
-__all__ = ["simulate_recording"]
+if TYPE_CHECKING:
+    from rfpose.simulator import Simulator
+
+__all__ = ["SimulatedRecording", "simulate"]
 
 
-def simulate_recording(
-    scenario_path: str | Path,
-    recording_path: str | Path,
-    *,
-    seed: int,
-    force: bool = False,
-    on_progress: Callable[[int, int], None] | None = None,
-) -> dict[str, Any]:
-    """Write the recording that a site would make, with the truth behind it.
+def simulate(scenario: Scenario | str | Path, *, seed: int = 0) -> SimulatedRecording:
+    """Return the recording that a site would make, with the truth behind it.
 
     Parameters
     ----------
-    scenario_path
-        TOML; its ``[simulation]`` table says what happens.
-    recording_path
-        File to write, format ``rfpose-iq``.
+    scenario
+        The site, or its TOML file; its ``[simulation]`` table says what happens.
     seed
         Same scenario and seed, same recording.
-    force
-        Overwrite an existing file.
-    on_progress
-        Called with (samples written, samples in all).
-
-    Returns
-    -------
-    dict
-        What was written: ``recording``, ``scenario``, ``seed``, ``frames``, ``frame_samples``, ``receivers``,
-        ``samples``, ``bytes``.
 
     Raises
     ------
     ScenarioError
         The scenario is malformed or cannot be simulated.
-    RecordingError
-        The file exists already, is the scenario, or cannot be written; nothing is left under its name.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    >>> recording = rf.simulate(site.changed(heliostat=site.heliostat[:2], simulation={"frame_count": 1}), seed=1)
+    >>> recording
+    <SimulatedRecording 'Table 2, 100 m field': 7 receivers, seed 1>
+    >>> recording.truth.normal_enu.shape
+    (1, 2, 3)
     """
-    recording_path = Path(recording_path)
-    with claim(recording_path, inputs=[scenario_path], force=force):
-        return _simulate(load_scenario(scenario_path), recording_path, seed=seed, on_progress=on_progress)
+    site = scenario_of(scenario)
+    from rfpose.simulator import Simulator  # compiled code, which no refusal should wait for
 
-
-def _simulate(
-    scenario: Scenario, recording_path: Path, *, seed: int, on_progress: Callable[[int, int], None] | None
-) -> dict[str, Any]:
-    from rfpose.simulate import Simulator  # compiled code, which no refusal should wait for
-
-    simulator = Simulator(scenario, seed=seed)
-    writer = RecordingWriter(
-        recording_path,
-        scenario=scenario,
-        receiver_ids=simulator.receiver_ids,
-        sample_rate=scenario.radio.sample_rate,
-        centre_frequency_hz=scenario.radio.centre_frequency_hz,
-        sample_format=simulator.sample_format,
-        full_scale=simulator.full_scale,
-        provenance={"made_by": f"rfpose simulate {__version__}", "seed": str(seed)},
+    return SimulatedRecording(
+        Simulator(site, seed=seed),
+        site,
+        seed=seed,
+        made_from=() if isinstance(scenario, Scenario) else (Path(scenario),),
     )
-    done = 0
-    with writer:
-        for chunk in simulator:
-            writer.write(chunk.receiver_id, chunk.start_index, chunk.samples)
-            done += len(chunk.samples)
-            if on_progress is not None:
-                on_progress(done, simulator.total_samples)
-        writer.write_truth(simulator.truth)
-    return {
-        "recording": recording_path,
-        "scenario": scenario.name,
-        "seed": seed,
-        "frames": len(simulator.frame_start_index),
-        "frame_samples": scenario.radio.frame_samples,
-        "receivers": len(simulator.receiver_ids),
-        "samples": done,
-        "bytes": writer.n_byte,
-    }
+
+
+class SimulatedRecording(Recording):
+    """A recording whose samples are made when they are read; `simulate` returns one.
+
+    It takes no memory, and gives the same samples each time. `save` writes them once and for all.
+    """
+
+    def __init__(self, simulator: Simulator, scenario: Scenario, *, seed: int, made_from: Sequence[Path] = ()) -> None:
+        super().__init__(
+            Path("simulated"),
+            format="rfpose-iq",
+            receiver_ids=simulator.receiver_ids,
+            sample_rate=scenario.radio.sample_rate,
+            centre_frequency_hz=scenario.radio.centre_frequency_hz,
+            sample_format=simulator.sample_format,
+            full_scale=simulator.full_scale,
+            scenario=scenario,
+            truth=simulator.truth,
+            provenance={"made_by": f"rfpose simulate {__version__}", "seed": str(seed)},
+        )
+        self._simulator = simulator
+        self._site = scenario
+        self._made_from = list(made_from)
+
+    def __repr__(self) -> str:
+        seed = self.provenance["seed"]
+        return f"<SimulatedRecording {self._site.name!r}: {len(self.receiver_ids)} receivers, seed {seed}>"
+
+    def files(self) -> list[Path]:
+        """Return the scenario's file, if it came from one."""
+        return self._made_from
+
+    def save(
+        self,
+        path: str | Path,
+        *,
+        format: str = "rfpose-iq",
+        force: bool = False,
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Write the recording, with scenario and truth; see `Recording.save`."""
+        if format != "rfpose-iq":
+            super().save(path, format=format, force=force, on_progress=on_progress)
+            return
+        path, done = Path(path), 0
+        with claim(path, inputs=self._made_from, force=force):
+            writer = RecordingWriter(
+                path,
+                scenario=self._site,
+                receiver_ids=self.receiver_ids,
+                sample_rate=self.sample_rate,
+                centre_frequency_hz=self.centre_frequency_hz,
+                sample_format=self.sample_format,
+                full_scale=self.full_scale,
+                provenance=self.provenance,
+                overwrite=True,
+            )
+            with writer:
+                for chunk in self._simulator:
+                    writer.write(chunk.receiver_id, chunk.start_index, chunk.samples)
+                    done += len(chunk.samples)
+                    if on_progress is not None:
+                        on_progress(done, self._simulator.total_samples)
+                writer.write_truth(self._simulator.truth)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what was simulated, with stable keys."""
+        return {
+            "scenario": self._site.name,
+            "seed": int(self.provenance["seed"]),
+            "frames": len(self._simulator.frame_start_index),
+            "frame_samples": self._site.radio.frame_samples,
+            "receivers": len(self.receiver_ids),
+            "samples": self._simulator.total_samples,
+        }
+
+    def _load_segments(self, receiver_id: str) -> npt.NDArray[np.int64]:
+        return self._simulator.stretches(receiver_id)
+
+    def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
+        start = int(self._segments_of(receiver_id)[i_segment, 0]) + skip
+        with ThreadPoolExecutor(thread_name_prefix="rfpose-simulate") as pool:
+            for at, samples in pool.map(lambda piece: piece(), self._simulator.pieces(receiver_id, start, len(out))):
+                out[at : at + len(samples)] = samples

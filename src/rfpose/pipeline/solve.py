@@ -84,7 +84,7 @@ def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> No
         raise ScenarioError(
             f"scenario `{scenario.name}` has no calibration receiver, and reflections cannot be told from what the "
             "transmitters' phases do without one; add a [[calibration_receiver]] at a surveyed place, or leave "
-            "reflections out (`--reflection ignore`)"
+            "reflections out (`reflection='ignore'`)"
         )
     longest = float(np.max(scenario.wavelength_m))
     for heliostat in scenario.heliostat:

@@ -1,19 +1,18 @@
-"""A scenario in, a tracking run out: resumable, the same bytes for the same seed."""
+"""A scenario in, a tracking run out: into a file resumable, the same bytes for the same seed."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfpose import __version__
-from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
+from rfpose.errors import ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline._checkpoint import Checkpoint
-from rfpose.scenario import Scenario, check_scenario, load_scenario
+from rfpose.scenario import Scenario, naming, scenario_of
 
 if TYPE_CHECKING:
     from rfpose.pipeline.track_file import Track
@@ -46,8 +45,8 @@ _AS_IT_STANDS = TrackChanges()
 
 
 def track(
-    scenario_path: str | Path,
-    result_path: str | Path,
+    scenario: Scenario | str | Path,
+    output: str | Path | None = None,
     *,
     methods: Sequence[str] = (),
     changes: TrackChanges = _AS_IT_STANDS,
@@ -58,15 +57,15 @@ def track(
     checkpoint_s: float = 20.0,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Track:
-    """Track a scenario's field by several methods and write what came of it.
+    """Track a scenario's field in simulation, by several methods on the same sun, wind and hidden errors.
 
     Parameters
     ----------
-    scenario_path
-        TOML.
-    result_path
-        File to write, format ``rfpose-tracking``. While the run lasts its state is kept beside it; a killed run goes on
-        from there and gives the same bytes.
+    scenario
+        The site, or its TOML file; its ``[tracking]`` table says what mounts, drives, wind, radio and cameras are like.
+    output
+        File to write, format ``rfpose-tracking``; None: none, see `Track.save`. While the run lasts its state is kept
+        beside it; a killed run goes on from there and gives the same bytes.
     methods
         Names; none: all that can steer the collector.
     changes
@@ -91,14 +90,23 @@ def track(
     RecordingError
         The file exists already, is one that is read, or cannot be written; unfinished work of another job is in the
         way.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> site = rf.load_scenario(rf.shipped_scenario("tracking_100m.toml"))
+    >>> short = site.changed(tracking={"first_hour": 11.5, "last_hour": 12.5, "field_control": None, "event": None})
+    >>> day = rf.track(short, methods=["open-loop"], heliostats=2)
+    >>> day
+    <Track 'Tracking, 100 m field': 2 mirrors, 1 day, best open-loop>
     """
-    result_path = Path(result_path)
-    place = result_path.with_name(f".{result_path.name}.state")
-    with claim(result_path, inputs=[scenario_path, place], force=force) as job:
-        base = load_scenario(scenario_path)
-        with _naming(scenario_path):
-            scenario = _with(base, changes)
-        records = {"wind": scenario.tracking.wind.record, "beam": scenario.tracking.beam_record}
+    place = None if output is None else Path(output).with_name(f".{Path(output).name}.state")
+    given = None if isinstance(scenario, Scenario) else scenario
+    with claim(output, inputs=[given, place], force=force) as job:
+        base = scenario_of(scenario)
+        with naming(scenario):
+            site = _with(base, changes)
+        records = {"wind": site.tracking.wind.record, "beam": site.tracking.beam_record}
         with claim(inputs=records.values()):  # none of the outputs may be one of them
             pass
         # compiled code, which none of the refusals above should wait for
@@ -106,57 +114,48 @@ def track(
         from rfpose.pipeline.track_file import track_of, write_track
         from rfpose.pipeline.track_iq import check_with_iq
 
-        with _naming(scenario_path):
-            simulation = Simulation(scenario, methods=methods, count=heliostats, seed=seed)
+        with naming(scenario):
+            simulation = Simulation(site, methods=methods, count=heliostats, seed=seed)
         settings = {
             "version": __version__,
             "seed": str(seed),
             "methods": " ".join(m.name for m in simulation.methods),
             "heliostats": str(len(simulation.field)),
         }
-        key = settings | {"scenario": hashlib.sha256(scenario.to_toml().encode()).hexdigest()}
+        key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()}
         for name, path in records.items():
             if path is not None:
                 key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-        checkpoint = Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
-        state = checkpoint.read()
-        with _naming(scenario_path):
-            iq = check_with_iq(scenario, check_iq, seed=seed)
+        checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
+        state = None if checkpoint is None else checkpoint.read()
+        with naming(scenario):
+            iq = check_with_iq(site, check_iq, seed=seed)
         if state is not None:
             simulation.restore(state)
         while simulation.done < simulation.n_segment:
             simulation.advance()
-            checkpoint.write(simulation.state())
+            if checkpoint is not None:
+                checkpoint.write(simulation.state())
             if on_progress is not None:
                 on_progress(simulation.done, simulation.n_segment)
         found = track_of(simulation, settings, iq=iq)
-        write_track(found, result_path)
-        job.afterwards(checkpoint.remove)
+        if output is not None:
+            write_track(found, output)
+        if checkpoint is not None:
+            job.afterwards(checkpoint.remove)
         return found
-
-
-@contextlib.contextmanager
-def _naming(scenario_path: str | Path) -> Iterator[None]:
-    """Name the scenario's file in what is wrong with it."""
-    try:
-        yield
-    except (ScenarioError, GeometryError, InvalidInputError) as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
 
 
 def _with(scenario: Scenario, changes: TrackChanges) -> Scenario:
     """Return the scenario with some keys of ``[tracking]`` changed."""
     keys = {"days": changes.days, "day_interval": changes.day_interval, "sky": changes.sky}
-    values = {name: value for name, value in keys.items() if value is not None}
-    data = scenario.model_dump(exclude_none=True)
-    table = {**data["tracking"], **values}
-    if values.get("sky") in ("clear", "bursts"):
-        table.pop("beam_record", None)
+    table: dict[str, Any] = {name: value for name, value in keys.items() if value is not None}
+    if changes.sky in ("clear", "bursts"):
+        table["beam_record"] = None
     if changes.without_field_control:
         if changes.events:
             raise ScenarioError("events need field control to act on; leave out one or the other")
-        table.pop("field_control", None)
-        table["event"] = ()
+        table |= {"field_control": None, "event": None}
     elif changes.events:
-        table["event"] = [*table.get("event", ()), *changes.events]
-    return check_scenario({**data, "tracking": table})
+        table["event"] = (*scenario.tracking.event, *changes.events)
+    return scenario.changed(tracking=table)

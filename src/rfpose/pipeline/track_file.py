@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import io
 import json
@@ -10,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import h5py
 import numpy as np
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.errors import RecordingError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.feedback.tracking._kernels import RADIO
@@ -27,11 +26,27 @@ from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
 from rfpose.kinds import check_kind, kind_of
+from rfpose.pipeline.columns import (
+    ENU,
+    Column,
+    ColumnWriter,
+    Labels,
+    dataset_of,
+    seconds_since,
+    text_label,
+    write_names,
+)
 from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
 from rfpose.pipeline.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import Scenario, parse_scenario
+from rfpose.shown import Shown, counted, number, plain
+from rfpose.tables import Tabled
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
 
 __all__ = [
     "FORMAT",
@@ -39,10 +54,9 @@ __all__ = [
     "MethodTrack",
     "Track",
     "is_track",
-    "read_track",
+    "open_track",
     "track_of",
     "write_track",
-    "write_track_csv",
 ]
 
 FORMAT = "rfpose-tracking"
@@ -50,37 +64,41 @@ VERSION = 2
 
 _SEASONS = {"Dec-Feb": (12, 1, 2), "Mar-May": (3, 4, 5), "Jun-Aug": (6, 7, 8), "Sep-Nov": (9, 10, 11)}
 _SERIES = {
-    "rms_rad": ("rad", "time", "normal error over the field at that instant, rms"),
-    "p95_rad": ("rad", "time", "the same, 95 %"),
-    "worst_rad": ("rad", "time", "the same, worst mirror"),
-    "normal_enu": ("1", "time, stored, xyz", "true normals of the stored mirrors"),
-    "error_rad": ("rad", "time, stored", "angle between true and wanted normal"),
-    "motor_count": ("steps", "time, stored, axis", "motor positions"),
-    "shift_enu": ("rad", "time, stored, xyz", "what feedback adds to the normal that the model is asked for"),
-    "flux": ("1", "time", "light on the receiver over that of a perfect field on its aim"),
-    "mode_count": ("", "time, mode", "mirrors in each mode, numbered as under mode/name"),
-    "mode": ("", "time, stored", "modes of the stored mirrors"),
+    "rms_rad": Column(("time",), "", "rad", "normal error over the field at that instant, rms"),
+    "p95_rad": Column(("time",), "", "rad", "the same, 95 %"),
+    "worst_rad": Column(("time",), "", "rad", "the same, worst mirror"),
+    "normal_enu": Column(("time", "stored", "xyz"), "", "1", "true normals of the stored mirrors"),
+    "error_rad": Column(("time", "stored"), "", "rad", "angle between true and wanted normal"),
+    "motor_count": Column(("time", "stored", "axis"), "", "steps", "motor positions"),
+    "shift_enu": Column(
+        ("time", "stored", "xyz"), "", "rad", "what feedback adds to the normal that the model is asked for"
+    ),
+    "flux": Column(("time",), "", "1", "light on the receiver over that of a perfect field on its aim"),
+    "mode_count": Column(("time", "mode_name"), "", "1", "mirrors in each mode, numbered as under mode/name"),
+    "mode": Column(("time", "stored"), "", "", "modes of the stored mirrors", Mode),
 }
 _SCORES = {
-    "heliostat_rms_rad": ("rad", "heliostat", "normal error, rms over all days"),
-    "heliostat_p95_rad": ("rad", "heliostat", "normal error, 95 %"),
-    "heliostat_worst_rad": ("rad", "heliostat", "normal error, worst"),
-    "heliostat_intercept": ("1", "heliostat", "light caught over light that a perfect tracker would catch"),
-    "hour_rms_rad": ("rad", "hour", "normal error by hour of local mean solar time"),
-    "day_rms_rad": ("rad", "day", "normal error by day"),
-    "day_worst_heliostat_rad": ("rad", "day", "rms of the day's worst mirror"),
-    "day_intercept": ("1", "day", "by day"),
-    "by_mode": ("s, J/m²", "mode, seconds-offered-caught", "time and light of a mirror in each mode, all days"),
+    "heliostat_rms_rad": Column(("heliostat",), "", "rad", "normal error, rms over all days"),
+    "heliostat_p95_rad": Column(("heliostat",), "", "rad", "normal error, 95 %"),
+    "heliostat_worst_rad": Column(("heliostat",), "", "rad", "normal error, worst"),
+    "heliostat_intercept": Column(
+        ("heliostat",), "", "1", "light caught over light that a perfect tracker would catch"
+    ),
+    "hour_rms_rad": Column(("hour",), "", "rad", "normal error by hour of local mean solar time"),
+    "day_rms_rad": Column(("day",), "", "rad", "normal error by day"),
+    "day_worst_heliostat_rad": Column(("day",), "", "rad", "rms of the day's worst mirror"),
+    "day_intercept": Column(("day",), "", "1", "by day"),
+    "by_mode": Column(("mode_name", "total"), "", "s, J/m²", "time and light of a mirror in each mode, all days"),
 }
 _INTEGERS = ("mode_count", "mode", "stored", "day")
 MODE_NAMES = tuple(mode.name.lower() for mode in Mode)
 _FIELD = {
-    "heliostat/pivot_enu_m": ("m", "heliostat, xyz", "nominal pivots"),
-    "heliostat/target_enu_m": ("m", "heliostat, xyz", "aim points; NaN for a dish"),
-    "heliostat/stored": ("", "stored", "row of each stored mirror"),
-    "time/unix_s": ("s", "time", "instants of the series, UTC"),
-    "time/day": ("", "time", "which day each belongs to"),
-    "time/sun_enu": ("1", "time, xyz", "towards the sun"),
+    "heliostat/pivot_enu_m": Column(("heliostat", "xyz"), "", "m", "nominal pivots"),
+    "heliostat/target_enu_m": Column(("heliostat", "xyz"), "", "m", "aim points; NaN for a dish"),
+    "heliostat/stored": Column(("stored",), "", "index", "row of each stored mirror"),
+    "time/unix_s": Column(("time",), "", "s", "instants of the series, UTC"),
+    "time/day": Column(("time",), "", "index", "which day each belongs to"),
+    "time/sun_enu": Column(("time", "xyz"), "", "1", "towards the sun"),
 }
 
 
@@ -112,8 +130,8 @@ class MethodTrack:
     happened: tuple[Mapping[str, Any], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Track(Shown, Tabled):
     """A tracking run.
 
     Attributes
@@ -146,6 +164,78 @@ class Track:
     sun_enu: FloatArray
     methods: Mapping[str, MethodTrack]
     iq: tuple[Mapping[str, Any], ...] = ()
+
+    def headline(self) -> str:
+        """Return of what, how much, and the method that catches most light."""
+        counts = f"{counted(len(self.heliostat_ids), 'mirror')}, {counted(len(self.dates), 'day')}"
+        return f"{self.scenario.name!r}: {counts}, best {self.ranking()[0]}"
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return one row a method, the one that catches most light first; errors of the normal [mrad]."""
+        rows = []
+        for name in self.ranking():
+            found = self.methods[name].summary
+            cells = (*(found["normal_mrad"][key] for key in ("rms", "p95", "worst")), found["intercept"])
+            rows.append([name, *(number(cell, 4) for cell in cells)])
+        return ["method", "rms [mrad]", "95 % [mrad]", "worst [mrad]", "light caught"], rows
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a method and mirror: errors of the normal [mrad], intercept."""
+        columns = ("heliostat_rms_rad", "heliostat_p95_rad", "heliostat_worst_rad")
+        rows: list[list[Any]] = []
+        for method in self.methods.values():
+            for i, name in enumerate(self.heliostat_ids):
+                errors = [1e3 * float(method.scores[c][i]) for c in columns]
+                rows.append([method.name, name, *errors, float(method.scores["heliostat_intercept"][i])])
+        header = ["method", "heliostat", "normal_rms_mrad", "normal_p95_mrad", "normal_worst_mrad", "intercept"]
+        return header, rows
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the run, format ``rfpose-tracking``.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite what exists.
+
+        Raises
+        ------
+        RecordingError
+            The file exists, or cannot be written.
+        """
+        write_track(self, path, force=force)
+
+    def to_xarray(self, method: str) -> xr.Dataset:
+        """Return what a method did, with labelled dimensions: time, mirrors, modes; needs xarray.
+
+        Series over time have the names of the file, scores ``score_`` before theirs; ``sun_enu`` and the mirrors'
+        places are there too.
+
+        Raises
+        ------
+        InvalidInputError
+            xarray is not installed; the run has no such method.
+        """
+        if method not in self.methods:
+            raise InvalidInputError(f"`method` must be one of {', '.join(self.methods)}, got {method!r}")
+        found = self.methods[method]
+        columns = {name: (column, found.series[name]) for name, column in _SERIES.items()}
+        columns |= {f"score_{name}": (column, found.scores[name]) for name, column in _SCORES.items()}
+        for place, column in _FIELD.items():
+            name = place.partition("/")[2]
+            if name not in ("stored", "unix_s"):  # the labels of two dimensions; `day` is the name of a third
+                columns["i_day" if name == "day" else name] = (column, getattr(self, name))
+        return dataset_of(
+            columns, _labels(self), {"scenario": self.scenario.name, "method": found.text, **self.settings}
+        )
+
+    def plot(self) -> Figure:
+        """Draw error, flux and modes in the course of the first day, errors spread over mirrors, and by day."""
+        from rfpose.pipeline.track_pictures import draw_track
+
+        return draw_track(self)
 
     def ranking(self) -> list[str]:
         """Return the methods' names, the one that catches most light first."""
@@ -193,7 +283,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequenc
             text=method.text,
             series={name: getattr(curves, name) for name in _SERIES},
             scores={name: getattr(found, name) for name in _SCORES},
-            summary=_plain(found.as_dict() | _over_the_year(simulation, found) | _foreseen(simulation, method.name)),
+            summary=plain(found.as_dict() | _over_the_year(simulation, found) | _foreseen(simulation, method.name)),
             happened=tuple(simulation.happened(method.name)),
         )
     return Track(
@@ -208,7 +298,7 @@ def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequenc
         day=read_only(simulation.stored_day),
         sun_enu=read_only(simulation.stored_sun_enu),
         methods=methods,
-        iq=tuple(_plain(each.as_dict()) for each in iq),
+        iq=tuple(plain(each.as_dict()) for each in iq),
     )
 
 
@@ -235,31 +325,13 @@ def _over_the_year(simulation: Simulation, found: Score) -> dict[str, Any]:
     return {"season_rms_mrad": seasons, "year": year}
 
 
-def _plain(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Give lists instead of arrays, None instead of NaN: as JSON would give them back."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, np.ndarray | list):
-            return [plain(item) for item in value]
-        if isinstance(value, np.generic):
-            value = value.item()
-        if value is None or isinstance(value, str):
-            return value
-        return None if not np.isfinite(value) else value
-
-    result: dict[str, Any] = plain(found)
-    return result
-
-
-def write_track(track: Track, path: str | Path) -> None:
-    """Write a run in one go; the same run gives the same bytes.
+def write_track(track: Track, path: str | Path, *, force: bool = True) -> None:
+    """Write a run in one go; the same run gives the same bytes. Without ``force`` nothing is replaced.
 
     Raises
     ------
     RecordingError
-        The file cannot be written; what stood under ``path`` is untouched.
+        The file exists and may not be replaced, or cannot be written; what stood under ``path`` is untouched.
     """
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110")) as file:
@@ -269,18 +341,15 @@ def write_track(track: Track, path: str | Path) -> None:
         settings = file.create_group("settings")
         for name, text in sorted(track.settings.items()):
             settings.attrs[name] = text
-        _texts(file, "heliostat/id", track.heliostat_ids)
-        _texts(file, "day/date", track.dates)
-        _texts(file, "mode/name", MODE_NAMES)
-        for place, name in (
-            ("heliostat/pivot_enu_m", "pivot_enu_m"),
-            ("heliostat/target_enu_m", "target_enu_m"),
-            ("heliostat/stored", "stored"),
-            ("time/unix_s", "unix_s"),
-            ("time/day", "day"),
-            ("time/sun_enu", "sun_enu"),
-        ):
-            _write(file, place, getattr(track, name), _FIELD[place])
+        write_names(file, "heliostat/id", track.heliostat_ids)
+        write_names(file, "day/date", track.dates)
+        write_names(file, "mode/name", MODE_NAMES)
+        # one set of scales a group, since groups have the names of dimensions and the root has no room for both
+        labels = _labels(track)
+        writers = {top: ColumnWriter(file.require_group(top), labels) for top in ("heliostat", "time", "method")}
+        for place, column in _FIELD.items():
+            top, _, name = place.partition("/")
+            writers[top].write(file[top], name, column, getattr(track, name))
         file.create_dataset("iq", data=json.dumps(track.iq))
         file.attrs["methods"] = json.dumps(list(track.methods))
         for method in track.methods.values():
@@ -288,21 +357,26 @@ def write_track(track: Track, path: str | Path) -> None:
             group.attrs["text"] = method.text
             group.attrs["summary"] = json.dumps(method.summary)
             group.create_dataset("happened", data=json.dumps(method.happened))
-            for name, key in _SERIES.items():
-                _write(group, name, method.series[name], key)
-            for name, key in _SCORES.items():
-                _write(group, f"score/{name}", method.scores[name], key)
-    write_atomically(path, image.getvalue())
+            for name, column in _SERIES.items():
+                writers["method"].write(group, name, column, method.series[name])
+            for name, column in _SCORES.items():
+                writers["method"].write(group.require_group("score"), name, column, method.scores[name])
+    write_atomically(path, image.getvalue(), force=force)
 
 
-def _write(file: h5py.Group, place: str, values: npt.NDArray[Any], key: tuple[str, str, str]) -> None:
-    unit, axes, meaning = key
-    dataset = file.create_dataset(place, data=np.asarray(values))
-    dataset.attrs["unit"], dataset.attrs["axes"], dataset.attrs["meaning"] = unit, axes, meaning
-
-
-def _texts(file: h5py.File, place: str, texts: tuple[str, ...]) -> None:
-    file.create_dataset(place, data=np.array(texts, dtype=object), dtype=h5py.string_dtype())
+def _labels(track: Track) -> Labels:
+    """Return what the entries along each dimension are called."""
+    return {
+        "time": seconds_since(track.unix_s, "seconds", "instant of the series, UTC"),
+        "heliostat": text_label(track.heliostat_ids, "heliostat"),
+        "stored": text_label([track.heliostat_ids[i] for i in track.stored], "heliostat whose course is kept"),
+        "day": text_label(track.dates, "simulated day"),
+        "hour": (np.arange(24), {"long_name": "hour of local mean solar time"}),
+        "mode_name": text_label(MODE_NAMES, "mode"),
+        "axis": (np.array([1, 2]), {"long_name": "axis of the mount"}),
+        "xyz": text_label(ENU, "axis of the site's frame"),
+        "total": text_label(("seconds", "offered", "caught"), "what is summed"),
+    }
 
 
 def is_track(path: str | Path) -> bool:
@@ -310,7 +384,7 @@ def is_track(path: str | Path) -> bool:
     return kind_of(path) == "track"
 
 
-def read_track(path: str | Path) -> Track:
+def open_track(path: str | Path) -> Track:
     """Read a tracking run.
 
     Raises
@@ -318,6 +392,11 @@ def read_track(path: str | Path) -> Track:
     RecordingError
         Missing, truncated, another format or version, or something in it is missing, of another type or shape, or says
         what no run says; the message names the file and the place.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> rf.open_track("day.h5").to_pandas()  # doctest: +SKIP
     """
     path = Path(path)
     check_kind(path, wanted="track")
@@ -413,12 +492,12 @@ class _Reader:
     def __init__(self, path: Path, file: h5py.File) -> None:
         self._path = path
         self._file = file
-        self._length = {"xyz": 3, "axis": 2, "hour": 24, "mode": len(Mode), "seconds-offered-caught": 3}
+        self._length = {"xyz": 3, "axis": 2, "hour": 24, "mode_name": len(Mode), "total": 3}
 
     def track(self) -> Track:
         ids, dates = self._names("heliostat/id"), self._names("day/date")
         self._length |= {"heliostat": len(ids), "day": len(dates)}
-        field = {place.partition("/")[2]: self._array(place, key[1]) for place, key in _FIELD.items()}
+        field = {place.partition("/")[2]: self._array(place, column) for place, column in _FIELD.items()}
         self._check_index("heliostat/stored", field["stored"], 0, len(ids))
         self._check_index("time/day", field["day"], 0, len(dates))
         late = ~((field["unix_s"] >= 0.0) & (field["unix_s"] <= LAST_TIME_S))
@@ -451,13 +530,13 @@ class _Reader:
     def _method(self, name: str) -> MethodTrack:
         place = f"method/{name}"
         group = self._group(place)
-        series = {key: self._array(f"{place}/{key}", axes) for key, (_, axes, _) in _SERIES.items()}
+        series = {key: self._array(f"{place}/{key}", column) for key, column in _SERIES.items()}
         self._check_index(f"{place}/mode", series["mode"], -1, len(Mode))
         return MethodTrack(
             name=name,
             text=str(group.attrs.get("text", METHODS[name].text if name in METHODS else name)),
             series=series,
-            scores={key: self._array(f"{place}/score/{key}", axes) for key, (_, axes, _) in _SCORES.items()},
+            scores={key: self._array(f"{place}/score/{key}", column) for key, column in _SCORES.items()},
             summary=self._json(_SUMMARY, f"{place} summary", group),
             happened=tuple(self._json(_HAPPENED, f"{place}/happened")),
         )
@@ -501,16 +580,15 @@ class _Reader:
             raise self._error(place, f"`{where}`: {first['msg'][:1].lower()}{first['msg'][1:]}") from error
         return found
 
-    def _array(self, place: str, axes: str) -> npt.NDArray[Any]:
+    def _array(self, place: str, column: Column) -> npt.NDArray[Any]:
         dataset = find_item(self._file, f"/{place}", follow_links=False)
         name = place.rpartition("/")[2]
         kind = "iu" if name in _INTEGERS else "f"
         if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kind:
             raise self._error(place, f"is missing or holds no {'integers' if kind == 'iu' else 'numbers'}")
-        wanted = axes.split(", ")
-        lengths = [self._length.setdefault(axis, n) for axis, n in zip(wanted, dataset.shape, strict=False)]
-        if len(wanted) != dataset.ndim or tuple(lengths) != dataset.shape:
-            raise self._error(place, f"has shape {dataset.shape}, not ({axes})")
+        lengths = [self._length.setdefault(dim, n) for dim, n in zip(column.dims, dataset.shape, strict=False)]
+        if len(column.dims) != dataset.ndim or tuple(lengths) != dataset.shape:
+            raise self._error(place, f"has shape {dataset.shape}, not ({', '.join(column.dims)})")
         try:
             return read_only(array_of(self._file, f"/{place}", dataset.dtype.newbyteorder("=")))
         except RecordingError:
@@ -522,16 +600,3 @@ class _Reader:
         bad = values[(values < least) | (values >= end)]
         if bad.size:
             raise self._error(place, f"holds {bad[0]}, which means nothing")
-
-
-def write_track_csv(track: Track, path: str | Path) -> None:
-    """Write one row a method and mirror: errors of the normal [mrad], intercept."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["method", "heliostat", "normal_rms_mrad", "normal_p95_mrad", "normal_worst_mrad", "intercept"])
-    columns = ("heliostat_rms_rad", "heliostat_p95_rad", "heliostat_worst_rad")
-    for method in track.methods.values():
-        for i, name in enumerate(track.heliostat_ids):
-            errors = [f"{1e3 * method.scores[c][i]:.6g}" for c in columns]
-            writer.writerow([method.name, name, *errors, f"{method.scores['heliostat_intercept'][i]:.6g}"])
-    write_atomically(path, text.getvalue().encode())

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.timeline import days
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.process import process
-from rfpose.pipeline.simulate import simulate_recording
+from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario
 
 __all__ = ["IqCheck", "IqComparison", "check_with_iq", "compare_with_iq"]
@@ -99,11 +97,7 @@ def compare_with_iq(scenario: Scenario, *, heliostat: str, normal_enu: FloatArra
         raise InvalidInputError(f"`heliostat` must be one of the scenario's, got {heliostat!r}")
     normal = geometry.unit(normal_enu)
     site = _postures(scenario, scenario.heliostat_ids.index(heliostat), normal)
-    with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        (place / "site.toml").write_text(site.to_toml(), encoding="utf-8")
-        simulate_recording(place / "site.toml", place / "recording.h5", seed=seed)
-        result = process(place / "recording.h5", place / "result.h5", estimator="correlator")
+    result = process(simulate(site, seed=seed), estimator="correlator")
     rot = geometry.rot_enu_from_mirror(normal)
     off = result.poses.normal_enu[0] - normal
     error = np.stack([np.sum(off * rot[:, :, i], axis=1) for i in (0, 1)], axis=1)
@@ -161,12 +155,10 @@ def _rms(parts: FloatArray) -> float:
 
 def _postures(scenario: Scenario, i_heliostat: int, normal_enu: FloatArray) -> Scenario:
     """Return the scenario with one mirror standing in each posture."""
-    data = scenario.model_dump(exclude_none=True)
-    like = data["heliostat"][i_heliostat]
-    n_receiver = len(like["receiver_mirror_m"])
-    data["heliostat"] = [
-        {**like, "id": f"P{k}", "normal_enu": tuple(n), "receiver_ids": [f"P{k}_r{r}" for r in range(n_receiver)]}
+    like = scenario.heliostat[i_heliostat].model_dump(exclude_none=True)
+    receivers = range(len(like["receiver_mirror_m"]))
+    heliostats = [
+        {**like, "id": f"P{k}", "normal_enu": n, "receiver_ids": [f"P{k}_r{r}" for r in receivers]}
         for k, n in enumerate(normal_enu.tolist())
     ]
-    data["simulation"] |= {"frame_count": 1, "blocked": (), "dropped": ()}
-    return Scenario.model_validate(data)
+    return scenario.changed(heliostat=heliostats, simulation={"frame_count": 1, "blocked": None, "dropped": None})

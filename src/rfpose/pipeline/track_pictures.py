@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rfpose.pipeline.pictures import _save
+from rfpose.drawing import blank_figure
 from rfpose.pipeline.track_file import Track
 from rfpose.pipeline.track_view import groups, local_hour, mode_text, what_happened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 __all__ = ["draw_track"]
 
@@ -41,27 +41,16 @@ _LABEL_ROOM = 0.018
 _MOST_LABELS = 24
 
 
-def draw_track(track: Track, path: str | Path) -> None:
+def draw_track(track: Track) -> Figure:
     """Draw a run: error, flux and modes in the course of the first day, spread over mirrors, by day.
 
     Modes are those of the method that catches most light; without field control they are left out.
-
-    Raises
-    ------
-    InvalidInputError
-        ``path`` ends neither in .png nor in .svg.
-    RecordingError
-        The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     several, best = len(track.dates) > 1, track.ranking()[0]
     panels = ["course", "flux", *(["modes"] if track.methods[best].happened else []), "mirrors"]
     panels += ["days"] if several else []
     heights = {"course": 3.2, "flux": 1.5, "modes": 1.5, "mirrors": 2.8, "days": 2.4}
-    figure = Figure(figsize=(10.0, 1.3 + sum(heights[name] for name in panels)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(10.0, 1.3 + sum(heights[name] for name in panels))
     axes = dict(zip(panels, figure.subplots(len(panels), 1, height_ratios=[heights[n] for n in panels]), strict=True))
     colours = {name: _COLOURS.get(name, "#444444") for name in track.methods}
     _course(axes["course"], track, colours)
@@ -76,7 +65,7 @@ def draw_track(track: Track, path: str | Path) -> None:
     handles, labels = axes["flux"].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(f"{track.scenario.name}: {len(track.heliostat_ids)} mirrors")
-    _save(figure, path)
+    return figure
 
 
 def _course(axes: Axes, track: Track, colours: dict[str, str]) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,13 @@ import numpy.typing as npt
 from rfpose.checks import read_only
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.recording import keys
+from rfpose.recording.members import members
 from rfpose.scenario import Scenario
+from rfpose.shown import html_table, listed
 from rfpose.truth import Truth
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "COMPONENT_DTYPE",
@@ -170,6 +175,67 @@ class Recording(ABC):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {str(self.path)!r}, {len(self.receiver_ids)} receivers>"
+
+    def _repr_html_(self) -> str:
+        lasts = sum(int(count) for name in self.receiver_ids for count in self.blocks(name)[:, 1])
+        tuned = "unknown" if self.centre_frequency_hz is None else f"{1e-6 * self.centre_frequency_hz:g} MHz"
+        rows = [
+            ["receivers", listed(self.receiver_ids)],
+            ["sample rate", f"{1e-6 * float(self.sample_rate):g} MHz, {self.sample_format}"],
+            ["radio frequency", tuned],
+            ["samples of all receivers", f"{lasts:,}"],
+            ["scenario", "none" if self.scenario is None else self.scenario.name],
+            ["truth", "none" if self.truth is None else "of a simulation"],
+        ]
+        return html_table(repr(self)[1:-1], ["", ""], rows)
+
+    def files(self) -> list[Path]:
+        """Return what it is read from: nothing else may be written there."""
+        return [self.path, *members(self.path)]
+
+    def save(
+        self,
+        path: str | Path,
+        *,
+        format: str = "rfpose-iq",
+        force: bool = False,
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Write the recording in one of the known formats.
+
+        Parameters
+        ----------
+        path
+            File (rfpose-iq) or directory (the others) to make.
+        format, on_progress
+            As for `rfpose.recording.convert`.
+        force
+            Overwrite what exists.
+
+        Raises
+        ------
+        InvalidInputError
+            Unknown ``format``.
+        RecordingError
+            It exists, or cannot be written.
+        """
+        from rfpose.recording.conversion import convert
+
+        convert(self, path, format=format, overwrite=force, on_progress=on_progress)
+
+    def plot(self, *, receiver_id: str | None = None) -> Figure:
+        """Draw the spectrum of one receiver's first whole frame, by default the first's, with every line marked.
+
+        Raises
+        ------
+        InvalidInputError
+            No scenario that says where the lines are, no such receiver, or no whole frame.
+        RecordingError
+            The recording is damaged.
+        """
+        from rfpose.recording.picture import draw_spectrum
+
+        return draw_spectrum(self, receiver_id=receiver_id)
 
     @property
     def fill_value(self) -> float:

@@ -38,7 +38,7 @@ def convert(
     source: Recording,
     target_path: str | Path,
     *,
-    format: RecordingFormat,
+    format: str,
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -72,7 +72,7 @@ def convert(
     if format not in get_args(RecordingFormat):
         raise InvalidInputError(f"`format` must be one of {', '.join(get_args(RecordingFormat))}, got {format!r}")
     target = Path(target_path)
-    inputs = [source.path, *members(source.path)]
+    inputs = source.files()
     if format == "rfpose-iq":
         with claim(target, inputs=inputs, force=overwrite):
             _refuse_small_disk(source, target)

@@ -9,7 +9,7 @@ from rfpose.errors import RecordingError
 
 __all__ = ["FOLLOW", "refuse_outside", "refuse_tree_outside"]
 
-FOLLOW = "if you trust where it comes from, add `--follow-links` (`follow_links=True`)"
+FOLLOW = "if you trust where it comes from, add `follow_links=True`"
 """What to do about it, for messages."""
 
 

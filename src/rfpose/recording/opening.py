@@ -37,6 +37,12 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None, follow
         names the file, the place inside it and the remedy.
     ScenarioError
         The embedded scenario is malformed.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> with rf.open_recording("night.h5") as recording:  # doctest: +SKIP
+    ...     recording.plot()
     """
     path = Path(path)
     try:

@@ -6,10 +6,11 @@ contradictions. Every length is metres in the site ENU frame unless a name says 
 
 from __future__ import annotations
 
-from rfpose.scenario._reading import check_scenario, load_scenario, parse_scenario
-from rfpose.scenario._scenario import Receiver, Scenario
+from rfpose.scenario._reading import load_scenario, naming, parse_scenario, scenario_of
+from rfpose.scenario._scenario import Receiver, Scenario, check_scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
+from rfpose.scenario.positions import read_positions
 from rfpose.scenario.records import (
     ID_PATTERN,
     MAX_FRAME_SAMPLES,
@@ -54,5 +55,8 @@ __all__ = [
     "Transmitter",
     "check_scenario",
     "load_scenario",
+    "naming",
     "parse_scenario",
+    "read_positions",
+    "scenario_of",
 ]

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
-from rfpose.errors import ScenarioError
+from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
 from rfpose.foreign import parse_toml, read_text
 from rfpose.kinds import told_kind
 from rfpose.scenario._scenario import Scenario
+from rfpose.scenario._words import in_words
 from rfpose.scenario.records import Mirror
 
 SCENARIO_BYTES = 2**26
@@ -35,6 +37,12 @@ def load_scenario(path: str | Path, *, scale: float | None = None) -> Scenario:
     ScenarioError
         The file is missing, is not TOML, has unknown or mistyped keys, or contradicts itself. The message
         names the file, the key and the remedy.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    <Scenario 'Table 2, 100 m field': 10 transmitters, 1 tone, 12 heliostats>
     """
     if instead := told_kind(path, wanted="scenario"):
         raise ScenarioError(f"{path}: no scenario, but {instead}; give a site in TOML, as docs/scenario.md has it")
@@ -52,30 +60,31 @@ def parse_scenario(text: str, *, source: str = "scenario", scale: float | None =
         _fill_heliostats(data)
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
-        raise ScenarioError(f"{source}: {_in_words(error)}") from error
+        raise ScenarioError(f"{source}: {in_words(error)}") from error
     except ScenarioError as error:
         raise ScenarioError(f"{source}: {error}") from error
     factor = float(file_scale if scale is None else scale)
     try:
         return scenario.scaled(factor)
     except ValidationError as error:
-        raise ScenarioError(f"{source}: with `scale` {factor:g}: {_in_words(error)}") from error
+        raise ScenarioError(f"{source}: with `scale` {factor:g}: {in_words(error)}") from error
     except ScenarioError as error:
         raise ScenarioError(f"{source}: {error}") from error
 
 
-def check_scenario(data: Mapping[str, Any]) -> Scenario:
-    """Return a scenario from plain values, as `Scenario.model_dump` gives them and somebody has changed them.
+def scenario_of(source: Scenario | str | Path) -> Scenario:
+    """Return a scenario as it is, or that of a file; see `load_scenario`."""
+    return source if isinstance(source, Scenario) else load_scenario(source)
 
-    Raises
-    ------
-    ScenarioError
-        They contradict themselves; in the same words as for a file.
-    """
+
+@contextlib.contextmanager
+def naming(source: Scenario | str | Path) -> Iterator[None]:
+    """Name the scenario's file in what turns out to be wrong with it; a scenario from no file has none to name."""
     try:
-        return Scenario.model_validate(data)
-    except ValidationError as error:
-        raise ScenarioError(_in_words(error)) from error
+        yield
+    except (ScenarioError, GeometryError, InvalidInputError) as error:
+        place = "" if isinstance(source, Scenario) else f"{source}: "
+        raise ScenarioError(f"{place}{error}") from error
 
 
 def _fill_heliostats(data: dict[str, Any]) -> None:
@@ -83,7 +92,7 @@ def _fill_heliostats(data: dict[str, Any]) -> None:
     try:
         mirror = Mirror.model_validate(data.pop("mirror", {})).model_dump(exclude_none=True)
     except ValidationError as error:
-        raise ScenarioError(_in_words(error, "mirror")) from error
+        raise ScenarioError(in_words(error, "mirror")) from error
     heliostats = data.get("heliostat", [])
     if not isinstance(heliostats, list):
         return
@@ -95,23 +104,3 @@ def _fill_heliostats(data: dict[str, Any]) -> None:
         places = heliostat.get("receiver_mirror_m")
         if isinstance(places, list | tuple) and "id" in heliostat:
             heliostat.setdefault("receiver_ids", [f"{heliostat['id']}_r{k}" for k in range(len(places))])
-
-
-def _in_words(error: ValidationError, place: str = "") -> str:
-    """Put pydantic's first complaint as ``place: what is wrong``; places lie within ``place``."""
-    complaints = error.errors()
-    # a misspelt key is also a missing one; the misspelling is the better message
-    first = min(complaints, key=lambda c: c["type"] != "extra_forbidden")
-    for part in first["loc"]:
-        place += f"[{part}]" if isinstance(part, int) else f".{part}" if place else str(part)
-    if first["type"] == "extra_forbidden":
-        text = f"unknown key `{place}`; remove it or correct its spelling"
-    elif first["type"] == "missing":
-        text = f"`{place}` is missing"
-    elif first["type"] == "value_error":
-        reason = first["msg"].removeprefix("Value error, ")
-        text = f"`{place}`: {reason}" if place else reason
-    else:
-        text = f"`{place}` {first['msg'][:1].lower()}{first['msg'][1:]}, got {str(first['input'])[:80]}"
-    more = len(complaints) - 1
-    return text + (f" (and {more} more)" if more else "")

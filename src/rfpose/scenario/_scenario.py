@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, NamedTuple, Self
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
+import numpy.typing as npt
 import tomli_w
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from rfpose import geometry
-from rfpose.checks import FloatArray, read_only
+from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import ScenarioError
+from rfpose.files import write_atomically
 from rfpose.scenario._consistency import CHECKS
 from rfpose.scenario._scaling import scale_lengths
+from rfpose.scenario._words import in_words
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Reflection
+from rfpose.scenario.positions import read_positions
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
 from rfpose.scenario.tracking import Tracking
+from rfpose.shown import counted, html_table, listed
 
 
 class Receiver(NamedTuple):
@@ -207,6 +214,163 @@ class Scenario(Record):
         scale_lengths(data, factor)
         return Scenario.model_validate(data)
 
+    # -- another scenario --------------------------------------------------------------------------------
+
+    def changed(self, **tables: Any) -> Scenario:
+        """Return the scenario with some of its tables changed, and checked as a file is.
+
+        Parameters
+        ----------
+        **tables
+            By the names of the file. Of a table, the keys that are given are changed, down through tables in it, and
+            the others stay; None takes a key away, so that its default holds. Anything else, lists of tables too,
+            takes the place of what was there. Records may stand for tables.
+
+        Raises
+        ------
+        ScenarioError
+            Unknown keys, or a scenario that contradicts itself; in the words for a file.
+
+        Examples
+        --------
+        >>> import rfpose as rf
+        >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+        >>> short = site.changed(heliostat=site.heliostat[:3], simulation={"frame_count": 2, "tone_snr_db": 30.0})
+        >>> short.heliostat_ids, short.simulation.frame_count
+        (('H01', 'H02', 'H03'), 2)
+        """
+        return check_scenario(_merged(self.model_dump(exclude_none=True), tables))
+
+    def with_field(self, field: str | Path | npt.ArrayLike, *, ids: Sequence[str] | None = None) -> Scenario:
+        """Return the scenario with another field, each heliostat like the first, its own posture left out.
+
+        Impairments of receivers are left out, too, since they name those of the old field.
+
+        Parameters
+        ----------
+        field : (heliostat, xyz)
+            Pivots, site ENU [m]; or a CSV file of them, see `rfpose.scenario.read_positions`.
+        ids
+            Names of the heliostats; by default those of the file, else H1, H2 and so on.
+
+        Raises
+        ------
+        ScenarioError
+            No heliostat whose mirror could be taken; a name that no heliostat may have, or twice; a bad file.
+
+        Examples
+        --------
+        >>> import rfpose as rf
+        >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+        >>> site.with_field([[0.0, 40.0, 2.0], [10.0, 45.0, 2.0]]).heliostat_ids
+        ('H1', 'H2')
+        """
+        if not self.heliostat:
+            raise ScenarioError(
+                f"scenario `{self.name}` has no heliostat whose mirror the field could have; add a [[heliostat]]"
+            )
+        source = f"field of {field}: " if isinstance(field, str | Path) else ""
+        if isinstance(field, str | Path):
+            found, pivot = read_positions(field)
+        else:
+            pivot = as_float_array("field", field, ("heliostat", 3))
+            found = tuple(f"H{k + 1}" for k in range(len(pivot)))
+        first = self.heliostat[0]
+        like = first.model_dump(exclude_none=True, exclude={"normal_enu"})
+        receiver = range(len(first.receiver_mirror_m))
+        heliostats = [
+            {**like, "id": name, "pivot_enu_m": place, "receiver_ids": [f"{name}_r{k}" for k in receiver]}
+            for name, place in zip(found if ids is None else ids, pivot.tolist(), strict=True)
+        ]
+        try:
+            return self.changed(heliostat=heliostats, simulation={"blocked": None, "dropped": None})
+        except ScenarioError as error:
+            raise ScenarioError(f"{source}{error}") from error
+
+    def with_transmitters(self, transmitters: Sequence[Transmitter] | npt.ArrayLike, *, keep: int = 0) -> Scenario:
+        """Return the scenario with other transmitters; blockages of those that are gone go with them.
+
+        Parameters
+        ----------
+        transmitters : (transmitter, xyz)
+            Records; or places, site ENU [m]. At places, carriers and amplitudes are the scenario's own while they
+            last; more transmitters share the band evenly anew.
+        keep
+            At places: the first so many keep their names.
+
+        Raises
+        ------
+        ScenarioError
+            The band cannot hold so many carriers; the scenario contradicts itself.
+
+        Examples
+        --------
+        >>> import rfpose as rf
+        >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+        >>> fewer = site.with_transmitters(site.transmitter_enu_m[:6] + [0.0, 0.0, 5.0])
+        >>> fewer.transmitter_ids, fewer.transmitter[0].position_enu_m
+        (('T1', 'T2', 'T3', 'T4', 'T5', 'T6'), (100.0, 0.0, 25.0))
+        """
+        given: Any = transmitters
+        if isinstance(given, Sequence) and given and all(isinstance(one, Transmitter) for one in given):
+            new = tuple(given)
+        else:
+            new = self._transmitters_at(as_float_array("transmitters", given, ("transmitter", 3)), keep)
+        left = {one.id for one in new}
+        blocked = [one for one in self.simulation.blocked if one.transmitter in left]
+        return self.changed(transmitter=new, simulation={"blocked": blocked or None})
+
+    def _transmitters_at(self, place: FloatArray, keep: int) -> tuple[Transmitter, ...]:
+        names = [*self.transmitter_ids[:keep]]
+        names += [f"T{k + 1}" for k in range(len(place)) if f"T{k + 1}" not in names][: len(place) - keep]
+        radio = self.radio
+        if len(place) <= len(self.transmitter):
+            carrier = self.carrier_hz[: len(place)]
+        else:
+            half = 0.5 * radio.sample_rate_hz
+            margin = radio.clock_search_ppm * 1e-6 * (radio.centre_frequency_hz + half)
+            usable = half - margin - float(self.tone_hz.max())
+            carrier = np.linspace(-1.0, 1.0, len(place)) * usable * len(place) / (len(place) + 1.0)
+        amplitude = [*(t.amplitude for t in self.transmitter), *np.ones(len(place))]
+        return tuple(
+            Transmitter(id=name, position_enu_m=tuple(map(float, p)), carrier_hz=float(f), amplitude=float(a))
+            for name, p, f, a in zip(names, place, carrier, amplitude, strict=False)
+        )
+
+    # -- for people and files ----------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        parts = {"transmitter": self.transmitter, "tone": self.tone, "heliostat": self.heliostat}
+        return f"<Scenario {self.name!r}: {', '.join(counted(len(all_), what) for what, all_ in parts.items())}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            ["radio frequency", f"{1e-6 * self.radio.centre_frequency_hz:g} MHz"],
+            ["sample rate", f"{1e-6 * self.radio.sample_rate_hz:g} MHz"],
+            ["tones", ", ".join(f"{1e-6 * f:g} MHz" for f in self.tone_hz)],
+            ["transmitters", ", ".join(self.transmitter_ids)],
+            ["heliostats", listed(self.heliostat_ids)],
+            ["calibration receivers", listed([r.id for r in self.calibration_receiver])],
+        ]
+        return html_table(self.name, ["", ""], rows)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the scenario as TOML.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite what exists.
+
+        Raises
+        ------
+        RecordingError
+            The file exists, or cannot be written.
+        """
+        write_atomically(path, self.to_toml().encode(), force=force)
+
     def to_toml(self) -> str:
         """Return the scenario as TOML that `parse_scenario` reads back to an equal record."""
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
@@ -218,3 +382,41 @@ class Scenario(Record):
         for check in CHECKS:
             check(self)
         return self
+
+
+def check_scenario(data: Mapping[str, Any]) -> Scenario:
+    """Return a scenario from plain values, as those of a file are.
+
+    Raises
+    ------
+    ScenarioError
+        They contradict themselves; in the same words as for a file.
+    """
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(in_words(error)) from error
+
+
+def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain values with those of ``new`` in place of the old; tables go into each other, None takes away."""
+    out = dict(old)
+    for key, value in new.items():
+        if value is None:
+            out.pop(key, None)
+        elif isinstance(value, Mapping):
+            inner = out.get(key)
+            out[key] = _merged(inner if isinstance(inner, Mapping) else {}, value)
+        else:
+            out[key] = _plain(value)
+    return out
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Record):
+        return value.model_dump(exclude_none=True)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value

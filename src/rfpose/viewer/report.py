@@ -5,19 +5,17 @@ from __future__ import annotations
 import base64
 import html
 import platform
-import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfpose import __version__
+from rfpose.drawing import png_of
 from rfpose.errors import RfposeError
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.track_file import Track
-from rfpose.pipeline.track_pictures import draw_track
 from rfpose.pipeline.track_view import MODES, ON_RECEIVER, TrackPicture, clock
 from rfpose.recording import describe
 from rfpose.viewer.export import picture_tag
@@ -204,10 +202,7 @@ def _by_mode(track: Track) -> tuple[list[str], list[list[str]]]:
 
 
 def _drawn(track: Track) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "track.png"
-        draw_track(track, path)
-        return f'<img alt="" src="data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}">'
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png_of(track.plot())).decode()}">'
 
 
 def _words(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

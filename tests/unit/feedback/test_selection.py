@@ -20,7 +20,7 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import PARAMETERS, Mount
 from rfpose.feedback.paint import PaintHeliostat, read_heliostat
 from rfpose.feedback.selection import PLANNED_SIGMA, candidates, fit_chosen
-from rfpose.pipeline.calibrate import calibrate_paint
+from rfpose.pipeline.calibrate import calibrate
 from rfpose.pipeline.mount_file import read_models
 
 EAST, WEST = (20.0, 80.0, 1.5), (-30.0, 60.0, 1.5)
@@ -141,7 +141,7 @@ def test_with_redundancy_the_noise_is_the_measured_one(sound: Path) -> None:
 
 def test_too_many_parameters_for_the_records_are_told(sound: Path, tmp_path: Path) -> None:
     write_paint(tmp_path, {"AA11": EAST}, n_record=8, sigma_rad=1e-3)
-    (item,) = calibrate_paint(tmp_path, free="level-location")
+    (item,) = calibrate(tmp_path, parameters="level-location")
     assert any("do not carry" in note and "--parameters auto" in note for note in item.notes), item.notes
     assert len(PARAMETER_SETS["level-location"]) == 12
 
@@ -215,7 +215,7 @@ def test_bad_heliostats_are_named_by_file_and_key_and_the_others_are_fitted(tmp_
 
 def test_a_single_record_turns_the_zeros(tmp_path: Path) -> None:
     write_paint(tmp_path, {"AA11": EAST}, n_record=1)
-    (report,) = calibrate_paint(tmp_path)
+    (report,) = calibrate(tmp_path)
     assert report.calibration.choice is not None
     assert report.calibration.choice.chosen == "offsets"
     assert "too few measurements" in report.calibration.choice.reason
@@ -224,7 +224,7 @@ def test_a_single_record_turns_the_zeros(tmp_path: Path) -> None:
 
 def test_a_mount_far_from_its_plan_is_fitted_with_a_warning(folder: Path) -> None:
     edit(folder / PROPERTIES, lambda p: p["kinematics_properties"]["actuators"][1].update(initial_angle=1.3))
-    reports = {report.id: report for report in calibrate_paint(folder)}
+    reports = {report.id: report for report in calibrate(folder)}
     assert set(reports) == {"AA11", "AB12"}
     assert any("check its nominal values" in note for note in reports["AA11"].notes)
     assert reports["AB12"].notes == () or all("nominal" not in note for note in reports["AB12"].notes)
@@ -284,8 +284,8 @@ def test_an_azimuth_that_runs_otherwise_is_told_in_papers_terms(folder: Path) ->
     for path in (folder / "AA11" / "calibration").iterdir():
         edit(path, lambda record: record.update(sun_azimuth=180.0 - record["sun_azimuth"]))
     with pytest.raises(RecordingError, match="from north, clockwise; PAINT's is 180° minus that"):
-        calibrate_paint(folder, heliostats=("AA11",))
-    assert [report.id for report in calibrate_paint(folder)] == ["AB12"]
+        calibrate(folder, heliostats=("AA11",))
+    assert [report.id for report in calibrate(folder)] == ["AB12"]
 
 
 MOUNT = {"format": "rfpose-mount", "version": 1, "heliostat": {"A": {"pivot_enu_m": [0.0, 80.0, 3.0]}}}

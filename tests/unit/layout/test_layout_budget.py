@@ -12,7 +12,7 @@ from rfpose.layout.budget import SOURCES, error_budget, make_plan, target_slope
 from rfpose.layout.budget.world import World
 from rfpose.measurement import noise_of
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.simulate import Simulator
+from rfpose.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[3]
 SUN = geometry.enu_from_azimuth_elevation(np.radians(170.0), np.radians(50.0))

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from rfpose.errors import GeometryError, ScenarioError
-from rfpose.layout.fields import cornfield, radial_staggered, read_positions
+from rfpose.layout.fields import cornfield, radial_staggered
+from rfpose.scenario import read_positions
 
 
 def closest(place):

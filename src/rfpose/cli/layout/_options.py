@@ -35,7 +35,7 @@ def field_options(function: F) -> F:
         click.option("--day", type=click.DateTime(["%Y-%m-%d"]), help="Every half hour of this day, sun above 5°."),
         click.option(
             "--sun",
-            "suns",
+            "suns_deg",
             type=(float, float),
             multiple=True,
             metavar="AZ EL",

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     check_ending,
     check_scenario,
@@ -66,7 +67,7 @@ def command(
     output: Path | None,
     picture: Path | None,
     field: Path | None,
-    suns: tuple[tuple[float, float], ...],
+    suns_deg: tuple[tuple[float, float], ...],
     day: datetime | None,
     year: int | None,
     stow: bool,
@@ -81,12 +82,12 @@ def command(
     claimed = outputs(output, picture, inputs=[scenario, field], force=force)
     with claimed, progress("Drawing") as on_progress:
         check_scenario(scenario)
-        from rfpose.pipeline.layout import budget_layout, draw_budget, write_budget_csv
+        from rfpose.drawing import save_figure
 
-        found = budget_layout(
+        found = rfpose.budget(
             scenario,
-            postures=postures(suns, day, year, stow),
-            field_csv=field,
+            postures=postures(suns_deg, day, year, stow),
+            field=field,
             pose=pose,
             ground=ground,
             n_draw=draws,
@@ -94,9 +95,9 @@ def command(
             on_progress=on_progress,
         )
         if output is not None:
-            write_budget_csv(found, output)
+            found.save(output)
         if picture is not None:
-            draw_budget(found, picture)
+            save_figure(found.plot(), picture)
     summary = found.as_dict()
     if wants_json():
         emit_json({**summary, "output": output, "picture": picture})

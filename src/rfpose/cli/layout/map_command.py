@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     check_ending,
     check_scenario,
@@ -39,7 +40,7 @@ __all__ = ["command"]
 @click.option("--estimator", "estimators", type=click.Choice(ESTIMATORS), multiple=True,
               help="Default: all that the scenario allows; `scenario`: as `rfpose process` solves it.")  # fmt: skip
 @click.option("--snr", "tone_snr_db", type=float, help="Tone SNR [dB] instead of the scenario's.")
-@click.option("--line-of-sight", "plate", type=(float, float), metavar="WIDTH HEIGHT",
+@click.option("--line-of-sight", "sight", type=(float, float), metavar="WIDTH HEIGHT",
               help="Count only what receivers see past plates of this size [m].")  # fmt: skip
 @click.option("--behind", is_flag=True, help="Receivers flush with the plate look out of its back.")
 @click.option("--tower", type=(float, float), metavar="RADIUS TOP", help="And past a tower at the origin [m].")
@@ -53,47 +54,48 @@ def command(
     scenario: Path,
     estimators: tuple[str, ...],
     tone_snr_db: float | None,
-    plate: tuple[float, float] | None,
+    sight: tuple[float, float] | None,
     behind: bool,
     tower: tuple[float, float] | None,
     sensitivity: bool,
     picture: Path | None,
     csv_path: Path | None,
     field: Path | None,
-    suns: tuple[tuple[float, float], ...],
+    suns_deg: tuple[tuple[float, float], ...],
     day: datetime | None,
     year: int | None,
     stow: bool,
     force: bool,
 ) -> None:
     """Say what each mirror's normal can be known to, and what the loss of each transmitter costs."""
-    if (tower is not None or behind) and plate is None:
+    if (tower is not None or behind) and sight is None:
         raise click.UsageError("--tower and --behind need --line-of-sight WIDTH HEIGHT, the size of the plates")
     check_ending(picture, ".png", ".svg")
     with outputs(picture, csv_path, inputs=[scenario, field], force=force), progress("Mapping"):
         check_scenario(scenario)
+        from rfpose.drawing import save_figure
         from rfpose.layout.sight import Plates, Tower
-        from rfpose.pipeline.layout import Sight, draw_layout_map, map_layout, write_layout_csv
+        from rfpose.pipeline.layout import Sight
 
-        sight = None
-        if plate is not None:
-            sight = Sight(
-                plates=Plates(width_m=plate[0], height_m=plate[1], flush="back" if behind else "front"),
+        seen = None
+        if sight is not None:
+            seen = Sight(
+                plates=Plates(width_m=sight[0], height_m=sight[1], flush="back" if behind else "front"),
                 tower=None if tower is None else Tower(radius_m=tower[0], top_m=tower[1]),
             )
-        found = map_layout(
+        found = rfpose.layout_map(
             scenario,
             estimators=estimators or None,
-            postures=postures(suns, day, year, stow),
-            field_csv=field,
+            postures=postures(suns_deg, day, year, stow),
+            field=field,
             tone_snr_db=tone_snr_db,
-            sight=sight,
+            sight=seen,
             sensitivity=sensitivity,
         )
         if picture is not None:
-            draw_layout_map(found, picture)
+            save_figure(found.plot(), picture)
         if csv_path is not None:
-            write_layout_csv(found, csv_path)
+            found.save(csv_path)
     summary = found.as_dict()
     if wants_json():
         emit_json({**summary, "picture": picture, "csv": csv_path})

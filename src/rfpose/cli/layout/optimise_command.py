@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+import rfpose
 from rfpose.cli._support import (
     check_ending,
     check_scenario,
@@ -67,13 +68,23 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("--picture", type=click.Path(path_type=Path), help="With --pareto: PNG or SVG.")
 @click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True)
 @click.option("--statistic", default="rms", show_default=True, help="rms, worst, or a percentile such as p95.")
-@click.option("--radius", type=float, help="Farthest from the origin [m]; default: the farthest transmitter now.")
-@click.option("--outline", type=click.Path(path_type=Path), help="CSV of the allowed ground's corners, for --radius.")
+@click.option("--radius", "radius_m", type=float, help="Farthest from the origin [m]; default: as now.")
+@click.option(
+    "--outline",
+    "outline_csv",
+    type=click.Path(path_type=Path),
+    help="CSV of corners of the allowed ground.",
+)
 @click.option("--allow", **_CIRCLE, help="Further ground that may be used: a circle [m].")
 @click.option("--exclude", **_CIRCLE, help="Circle kept free [m].")
-@click.option("--height", type=(float, float), metavar="LOW HIGH", help="Antenna heights [m]; default: those now.")
-@click.option("--separation", type=float, help="Least distance of two towers [m]; default: a twentieth of the radius.")
-@click.option("--clearance", type=float, default=0.0, show_default=True, help="Least distance to heliostats [m].")
+@click.option("--height", "height_m", type=(float, float), metavar="LOW HIGH", help="Antennas [m]; default: as now.")
+@click.option(
+    "--separation",
+    "separation_m",
+    type=float,
+    help="Between towers [m]; default: radius/20.",
+)
+@click.option("--clearance", "clearance_m", type=float, default=0.0, show_default=True, help="To heliostats [m].")
 @click.option("--keep", type=click.IntRange(min=0), default=0, show_default=True, help="The first so many stay.")
 @click.option("--cost", type=(float, float, float), default=(1.0, 0.0, 0.0), metavar="TOWER HEIGHT CABLE",
               help="Cost of a tower, of a metre of height, of a metre of cable.")  # fmt: skip
@@ -95,7 +106,7 @@ def command(
     starts: int,
     seed: int,
     field: Path | None,
-    suns: tuple[tuple[float, float], ...],
+    suns_deg: tuple[tuple[float, float], ...],
     day: datetime | None,
     year: int | None,
     stow: bool,
@@ -108,7 +119,7 @@ def command(
     if pareto is None and (csv_path is not None or picture is not None):
         raise click.UsageError("--csv and --picture go with --pareto")
     check_ending(picture, ".png", ".svg")
-    claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline"]], force=force)
+    claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline_csv"]], force=force)
     with claimed:
         check_scenario(scenario)
         from rfpose.layout.optimise import Costs
@@ -118,8 +129,8 @@ def command(
             "statistic": statistic,
             "rules": _rules(**where),
             "costs": Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
-            "postures": postures(suns, day, year, stow),
-            "field_csv": field,
+            "postures": postures(suns_deg, day, year, stow),
+            "field": field,
             "starts": starts,
             "seed": seed,
         }
@@ -134,37 +145,34 @@ def command(
 
 
 def _rules(
-    radius: float | None,
-    outline: Path | None,
+    radius_m: float | None,
+    outline_csv: Path | None,
     allow: tuple[tuple[float, float, float], ...],
     exclude: tuple[tuple[float, float, float], ...],
-    height: tuple[float, float] | None,
-    separation: float | None,
-    clearance: float,
+    height_m: tuple[float, float] | None,
+    separation_m: float | None,
+    clearance_m: float,
     keep: int,
 ) -> Rules:
     from rfpose.pipeline.layout import Rules
 
     return Rules(
-        radius_m=radius,
-        outline_csv=outline,
+        radius_m=radius_m,
+        outline_csv=outline_csv,
         allowed_m=allow,
         excluded_m=exclude,
-        height_m=height,
-        separation_m=separation,
-        clearance_m=clearance,
+        height_m=height_m,
+        separation_m=separation_m,
+        clearance_m=clearance_m,
         keep=keep,
     )
 
 
 def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None) -> SitePlacement:
-    from rfpose.files import write_atomically
-    from rfpose.pipeline.layout import optimise_layout
-
     with progress("Searching") as on_progress:
-        found = optimise_layout(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
+        found = rfpose.optimise(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
     if output is not None:
-        write_atomically(output, found.scenario.to_toml().encode())
+        found.save(output)
     return found
 
 
@@ -185,14 +193,15 @@ def _show_places(summary: dict[str, Any], output: Path | None) -> None:
 def _compare(
     scenario: Path, counts: range, settings: dict[str, Any], csv_path: Path | None, picture: Path | None
 ) -> SitePlacements:
-    from rfpose.pipeline.layout import draw_placements, pareto_layout, write_placements_csv
+    from rfpose.drawing import save_figure
+    from rfpose.pipeline.layout import pareto
 
     with progress("Searching, number by number") as on_progress:
-        curve = pareto_layout(scenario, counts, on_progress=on_progress, **settings)
+        curve = pareto(scenario, counts, on_progress=on_progress, **settings)
     if csv_path is not None:
-        write_placements_csv(curve, csv_path)
+        curve.save(csv_path)
     if picture is not None:
-        draw_placements(curve, picture)
+        save_figure(curve.plot(), picture)
     return curve
 
 

@@ -23,6 +23,7 @@ __all__ = ["command"]
 @click.option("--success", type=float, default=1.0 - 1e-6, help="Wanted probability of right integers, of a mirror.")
 @click.option(
     "--band",
+    "band_hz",
     type=(float, float),
     metavar="LOW HIGH",
     help="Tones allowed [Hz]; default: up to half the carriers' spacing.",
@@ -37,7 +38,7 @@ def command(
     scenario: Path,
     accuracy_mrad: float,
     success: float,
-    band: tuple[float, float] | None,
+    band_hz: tuple[float, float] | None,
     n_tone: int | None,
     estimator: str,
     tone_snr_db: float | None,
@@ -52,7 +53,7 @@ def command(
             scenario,
             accuracy_mrad=accuracy_mrad,
             success=success,
-            band_hz=band,
+            band_hz=band_hz,
             n_tone=n_tone,
             estimator=estimator,
             tone_snr_db=tone_snr_db,

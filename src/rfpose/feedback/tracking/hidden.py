@@ -112,7 +112,7 @@ def field_positions(scenario: Scenario, count: int | None) -> tuple[tuple[str, .
     """
     listed = len(scenario.heliostat)
     if count is None and not listed:
-        raise ScenarioError("the scenario has no heliostats; add some, or say how many with --heliostats")
+        raise ScenarioError("the scenario has no heliostats; add some, or say how many with `heliostats=`")
     if count is not None and count < 1:
         raise ScenarioError(f"there must be one heliostat or more, got {count}")
     if count is None or count <= listed:

@@ -1,7 +1,6 @@
 """Where to put transmitters: what is allowed, what it costs, and the search."""
 
 from rfpose.layout.optimise.rules import Constraints, Costs, Zone
-from rfpose.layout.optimise.scenarios import scenario_with
 from rfpose.layout.optimise.search import (
     CRITERIA,
     Criterion,
@@ -23,5 +22,4 @@ __all__ = [
     "evaluate_placement",
     "optimise",
     "pareto",
-    "scenario_with",
 ]

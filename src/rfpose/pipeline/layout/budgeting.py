@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
-from rfpose.files import write_atomically
+from rfpose.drawing import new_figure
+from rfpose.errors import ScenarioError
 from rfpose.layout.budget import BudgetLine, ErrorBudget, error_budget, make_plan
-from rfpose.pipeline.layout.site import Postures, load_site, postures_of, stacked
-from rfpose.pipeline.pictures import _new_figure, _save
-from rfpose.scenario import Scenario
+from rfpose.pipeline.layout.site import Field, Postures, Site, load_site, postures_of, stacked
+from rfpose.scenario import Scenario, naming
+from rfpose.shown import Shown, number
+from rfpose.tables import Tabled
 
-__all__ = ["SiteBudget", "budget_layout", "draw_budget", "write_budget_csv"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["SiteBudget", "budget"]
 
 _LOST_SHARE = 1e-3
 """Lines below this share of the whole are left out of the picture."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SiteBudget:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SiteBudget(Shown, Tabled):
     """A scenario's budget over its field and postures."""
 
     scenario: Scenario
@@ -69,6 +70,37 @@ class SiteBudget:
             ],
         }
 
+    def headline(self) -> str:
+        """Return which scenario, and the whole error."""
+        return f"{self.scenario.name!r}: {number(1e3 * _rms(self.budget.whole.normal_rad))} mrad of the normal, rms"
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return each source's error of the normal, drawn and on the target, worst first."""
+        keys = ("normal_mrad", "monte_carlo_mrad", "target_m")
+        lines = [(line.name, self._line_dict(line)) for line in (*self.budget.lines, self.budget.whole)]
+        return ["source", "mrad", "drawn", "target [m]"], [[name, *(number(d[k]) for k in keys)] for name, d in lines]
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a source and heliostat, the field's rms first; mrad of the normal, metres on the target."""
+        columns = ("normal_mrad", "target_m", "monte_carlo_mrad", "monte_carlo_target_m")
+        rows: list[list[Any]] = []
+        for line in (*self.budget.lines, self.budget.whole):
+            field = self._line_dict(line)
+            rows.append([line.name, "field", *(field[key] for key in columns), line.assumed, line.remedy])
+            each = [
+                1e3 * self.by_heliostat(line.normal_rad),
+                self.by_heliostat(line.target_m),
+                1e3 * self.by_heliostat(line.drawn_normal_rad),
+                self.by_heliostat(line.drawn_target_m),
+            ]
+            for i, name in enumerate(self.scenario.heliostat_ids):
+                rows.append([line.name, name, *(values[i] for values in each), "", ""])
+        return ["source", "heliostat", *columns, "assumed", "remedy"], rows
+
+    def plot(self) -> Figure:
+        """Draw each source's error of the normal as a bar, worst first, with the whole below them."""
+        return _drawn(self)
+
     def _line_dict(self, line: BudgetLine) -> dict[str, float]:
         return {
             "normal_mrad": 1e3 * _rms(line.normal_rad),
@@ -83,11 +115,11 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def budget_layout(
-    scenario_path: str | Path,
+def budget(
+    scenario: Site,
     *,
     postures: Postures | None = None,
-    field_csv: str | Path | None = None,
+    field: Field = None,
     pose: str = "rigid",
     ground: str | None = None,
     n_draw: int = 200,
@@ -98,8 +130,8 @@ def budget_layout(
 
     Parameters
     ----------
-    scenario_path, field_csv, postures
-        As in `map_layout`.
+    scenario, field, postures
+        As in `layout_map`.
     pose
         ``rigid``, or ``independent``.
     ground
@@ -110,60 +142,41 @@ def budget_layout(
     Raises
     ------
     ScenarioError
-        As `map_layout`; heliostats that differ in what the solver knows of them; poses that are not determined.
+        As `layout_map`; heliostats that differ in what the solver knows of them; poses that are not determined.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> found = rf.budget(rf.shipped_scenario("table2_100m.toml"), n_draw=0)
+    >>> found.as_dict()["pose"], found.as_dict()["heliostats"]
+    ('rigid', 12)
     """
-    scenario = load_site(scenario_path, field_csv, settings=None if ground is None else {"ground": ground})
-    studied = postures_of(scenario, postures or Postures(), scenario_path)
-    try:
-        plan = make_plan(scenario, stacked([p.mirrors for p in studied]), pose=pose)
-    except (GeometryError, InvalidInputError, ScenarioError) as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
-    found = error_budget(plan, n_draw=n_draw, seed=seed, aim_enu_m=scenario.site.aim_enu_m, progress=on_progress)
+    site = load_site(scenario, field)
+    if ground is not None:
+        site = site.changed(budget={"ground": ground})
+    with naming(scenario):
+        studied = postures_of(site, postures or Postures())
+        plan = make_plan(site, stacked([p.mirrors for p in studied]), pose=pose)
+    found = error_budget(plan, n_draw=n_draw, seed=seed, aim_enu_m=site.site.aim_enu_m, progress=on_progress)
     blind = np.flatnonzero(~np.isfinite(found.whole.normal_rad))
     if blind.size:
-        name = scenario.heliostat_ids[int(blind[0]) % len(scenario.heliostat)]
-        raise ScenarioError(
-            f"{scenario_path}: the pose of heliostat `{name}` is not determined by its phases; add transmitters, a "
-            "calibration receiver, or a surveyed pivot"
-        )
-    return SiteBudget(scenario=scenario, posture_names=tuple(p.name for p in studied), budget=found)
+        name = site.heliostat_ids[int(blind[0]) % len(site.heliostat)]
+        with naming(scenario):
+            raise ScenarioError(
+                f"the pose of heliostat `{name}` is not determined by its phases; add transmitters, a calibration "
+                "receiver, or a surveyed pivot"
+            )
+    return SiteBudget(scenario=site, posture_names=tuple(p.name for p in studied), budget=found)
 
 
-def write_budget_csv(found: SiteBudget, path: str | Path) -> None:
-    """Write one row a source and heliostat, the field's rms first; mrad of the normal, metres on the target."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    columns = ("normal_mrad", "target_m", "monte_carlo_mrad", "monte_carlo_target_m")
-    writer.writerow(["source", "heliostat", *columns, "assumed", "remedy"])
-    for line in (*found.budget.lines, found.budget.whole):
-        field = found._line_dict(line)
-        writer.writerow([line.name, "field", *(f"{field[key]:.6g}" for key in columns), line.assumed, line.remedy])
-        each = [
-            1e3 * found.by_heliostat(line.normal_rad),
-            found.by_heliostat(line.target_m),
-            1e3 * found.by_heliostat(line.drawn_normal_rad),
-            found.by_heliostat(line.drawn_target_m),
-        ]
-        for i, name in enumerate(found.scenario.heliostat_ids):
-            writer.writerow([line.name, name, *(f"{values[i]:.6g}" for values in each), "", ""])
-    write_atomically(path, text.getvalue().encode())
-
-
-def draw_budget(found: SiteBudget, path: str | Path) -> None:
-    """Draw each source's error of the normal as a bar, worst first, with the whole below them.
-
-    Raises
-    ------
-    InvalidInputError
-        ``path`` ends neither in .png nor in .svg.
-    """
+def _drawn(found: SiteBudget) -> Figure:
     whole = found.budget.whole
     lines = [line for line in found.budget.lines if _rms(line.normal_rad) > _LOST_SHARE * _rms(whole.normal_rad)]
     rows = [*lines, whole]
     height = np.arange(len(rows))[::-1]
     linear = np.array([1e3 * _rms(line.normal_rad) for line in rows])
     drawn = np.array([1e3 * _rms(line.drawn_normal_rad) for line in rows])
-    figure, axes = _new_figure(9.2, 1.6 + 0.42 * len(rows))
+    figure, axes = new_figure(9.2, 1.6 + 0.42 * len(rows))
     colours = ["#0072B2"] * len(lines) + ["0.35"]
     axes.barh(height, linear, color=colours, height=0.6, label="to first order (grey: root of the sum of squares)")
     if np.isfinite(drawn).any():
@@ -180,4 +193,4 @@ def draw_budget(found: SiteBudget, path: str | Path) -> None:
     axes.set_axisbelow(True)
     axes.set_title(f"{found.scenario.name}: error budget")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-    _save(figure, path)
+    return figure

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
-from rfpose.files import write_atomically
+from rfpose.drawing import mark_places, new_figure
+from rfpose.errors import ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.budget import make_plan, noise_bound
 from rfpose.layout.maps import ESTIMATORS, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
 from rfpose.measurement import SCENARIO
-from rfpose.pipeline.layout.site import Posture, Postures, Sight, Sun, load_site, postures_of, stacked
-from rfpose.pipeline.pictures import _mark, _new_figure, _save
-from rfpose.scenario import Scenario, check_scenario
+from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
+from rfpose.scenario import Scenario, naming
+from rfpose.shown import Shown, counted, number
+from rfpose.tables import Tabled
 
-__all__ = ["LayoutMap", "SightMap", "draw_layout_map", "map_layout", "write_layout_csv"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["LayoutMap", "SightMap", "layout_map"]
 
 REFLECTION = "reflection"
 """The scenario's own solver, the ground's coefficient estimated with the poses; where ``[simulation.ground]`` is."""
@@ -56,8 +57,8 @@ class SightMap:
     seen_share: FloatArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LayoutMap:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class LayoutMap(Shown, Tabled):
     """What a field's normals can be known to; rows follow ``heliostat_ids``.
 
     Attributes
@@ -138,6 +139,36 @@ class LayoutMap:
             out["sensitivity"] = {name: _sensitivity_dict(ids, s) for name, s in self.sensitivity.items()}
         return out
 
+    def headline(self) -> str:
+        """Return which scenario, and how many heliostats and postures."""
+        counts = f"{counted(len(self.heliostat_ids), 'heliostat')}, {counted(self.n_posture, 'posture')}"
+        return f"{self.scenario.name!r}: {counts}"
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return the bound of the normal over the field, by estimator."""
+        rows = [[name, *(number(v, 4) for v in summarise(mrad).values())] for name, mrad in self.rms_mrad.items()]
+        return ["bound of the normal [mrad]", *summarise(self.pdop)], rows
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a heliostat: place, dilution, the normal's bound by estimator, and how much it sees."""
+        names = list(self.rms_mrad)
+        header = ["id", "east_m", "north_m", "up_m", "pdop", "vdop"]
+        header += [f"normal_{name}_{kind}_mrad" for name in names for kind in ("rms", "worst")]
+        header += ["seen_mean", "seen_least"] if self.sight else []
+        rows = []
+        for i, name in enumerate(self.heliostat_ids):
+            values = [*self.pivot_enu_m[i], self.pdop[i], self.vdop[i]]
+            for key in names:
+                values += [self.rms_mrad[key][i], self.worst_mrad[key][i]]
+            if self.sight is not None:
+                values += [self.sight.seen_mean[:, i].mean(), self.sight.seen_least[:, i].min()]
+            rows.append([name, *values])
+        return header, rows
+
+    def plot(self, *, estimator: str | None = None) -> Figure:
+        """Draw the field from above, each heliostat in the colour of its normal's bound; by default the first's."""
+        return _drawn(self, estimator or next(iter(self.rms_mrad)))
+
 
 def _sensitivity_dict(ids: tuple[str, ...], found: TransmitterSensitivity) -> dict[str, Any]:
     """Loss [mrad], survey [mrad per mm], and move [mrad per m]."""
@@ -151,23 +182,23 @@ def _sensitivity_dict(ids: tuple[str, ...], found: TransmitterSensitivity) -> di
     }
 
 
-def map_layout(
-    scenario_path: str | Path,
+def layout_map(
+    scenario: Site,
     *,
     estimators: Sequence[str] | None = None,
     suns_deg: Sequence[Sun] = (),
     postures: Postures | None = None,
-    field_csv: str | Path | None = None,
+    field: Field = None,
     tone_snr_db: float | None = None,
     sight: Sight | None = None,
     sensitivity: bool = False,
 ) -> LayoutMap:
-    """Return the map of a scenario's heliostats, or of those in a CSV file with the first heliostat's mirror.
+    """Return what each mirror's normal can be known to, over a scenario's field or another.
 
     Parameters
     ----------
-    scenario_path
-        TOML.
+    scenario
+        The site, or its TOML file.
     estimators
         Out of `NAMES`: ``scenario``, what `rfpose process` makes of it, without reflections; those of
         `rfpose.layout.maps.ESTIMATORS`; and ``reflection``: the scenario's own solver with the ground's coefficient
@@ -177,8 +208,8 @@ def map_layout(
     postures
         Days, years, suns, stow. Without: each heliostat's own normal, else the simulated sun's first posture, else
         level.
-    field_csv
-        See `rfpose.layout.fields.read_positions`.
+    field : (heliostat, xyz)
+        Heliostats like the first instead of the scenario's: pivots [m] or a CSV file; see `Scenario.with_field`.
     tone_snr_db
         Overrides the scenario's.
     sight
@@ -191,17 +222,35 @@ def map_layout(
     ScenarioError
         The scenario or CSV is bad; transmitters too few, on a line or plane; heliostats on each other or on a
         transmitter; the field wider than the longest tone resolves; an estimator that the scenario does not allow. The
-        message begins with the file.
+        message begins with the file, if there is one.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> rf.layout_map(rf.shipped_scenario("table2_100m.toml"), estimators=["rigid"])
+    <LayoutMap 'Table 2, 100 m field': 12 heliostats, 1 posture>
     """
-    scenario = load_site(scenario_path, field_csv)
+    site = load_site(scenario, field)
+    with naming(scenario):
+        return _map(site, estimators, postures or Postures(suns_deg=suns_deg), tone_snr_db, sight, sensitivity)
+
+
+def _map(
+    scenario: Scenario,
+    estimators: Sequence[str] | None,
+    postures: Postures,
+    tone_snr_db: float | None,
+    sight: Sight | None,
+    sensitivity: bool,
+) -> LayoutMap:
     transmitter = scenario.transmitter_enu_m
     if estimators is None:
         estimators = [name for name in NAMES if not _lacks(scenario, name, sight)]
     for name in estimators:
         lacking = _lacks(scenario, name, sight)
         if lacking:
-            raise ScenarioError(f"{scenario_path}: estimator `{name}` {lacking}")
-    studied = postures_of(scenario, postures or Postures(suns_deg=suns_deg), scenario_path)
+            raise ScenarioError(f"estimator `{name}` {lacking}")
+    studied = postures_of(scenario, postures)
     seen = (
         None if sight is None else [visible(transmitter, p.mirrors, sight.plates, tower=sight.tower) for p in studied]
     )
@@ -209,7 +258,7 @@ def map_layout(
     rms, worst, by_posture, undetermined, lost, response = {}, {}, {}, {}, {}, {}
     for name in estimators:
         if name == REFLECTION:
-            sigma = 1e3 * np.array([_with_reflection(scenario, p, tone_snr_db, scenario_path) for p in studied])
+            sigma = 1e3 * np.array([_with_reflection(scenario, p, tone_snr_db) for p in studied])
         else:
             study = maps.study_of(scenario, name, tone_snr_db=tone_snr_db)
             sigma = 1e3 * np.array(
@@ -250,7 +299,7 @@ def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
     if name == REFLECTION and scenario.simulation.ground is None:
         return "needs a ground that reflects; add [simulation.ground], or choose another"
     if name == REFLECTION and sight is not None:
-        return "knows no line of sight; leave --line-of-sight away, or choose another"
+        return "knows no line of sight; leave `sight=` away, or choose another"
     if carrier and not scenario.has_rf_carriers:
         return (
             "needs carriers whose radio frequencies are above zero; set `radio.centre_frequency_hz`, or choose another"
@@ -258,16 +307,10 @@ def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
     return ""
 
 
-def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | None, path: str | Path) -> FloatArray:
+def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | None) -> FloatArray:
     """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
-    data = scenario.model_dump(exclude_none=True)
-    data["budget"] = {**data.get("budget", {}), "ground": "estimated"}
-    if tone_snr_db is not None:
-        data["simulation"] = {**data.get("simulation", {}), "tone_snr_db": tone_snr_db}
-    try:
-        return noise_bound(make_plan(check_scenario(data), posture.mirrors))
-    except (GeometryError, InvalidInputError, ScenarioError) as error:
-        raise ScenarioError(f"{path}: {error}") from error
+    snr = {} if tone_snr_db is None else {"tone_snr_db": tone_snr_db}
+    return noise_bound(make_plan(scenario.changed(budget={"ground": "estimated"}, simulation=snr), posture.mirrors))
 
 
 def _rms(sigma: FloatArray, axis: int) -> FloatArray:
@@ -308,35 +351,9 @@ def _without_each(study: Study, postures: list[Posture], seen: list[BoolArray] |
     return np.where(np.isnan(rms), np.inf, rms)
 
 
-def write_layout_csv(found: LayoutMap, path: str | Path) -> None:
-    """Write one row a heliostat: place, dilution, the normal's bound by estimator, and how much it sees."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    names = list(found.rms_mrad)
-    header = ["id", "east_m", "north_m", "up_m", "pdop", "vdop"]
-    header += [f"normal_{name}_{kind}_mrad" for name in names for kind in ("rms", "worst")]
-    writer.writerow(header + (["seen_mean", "seen_least"] if found.sight else []))
-    for i, name in enumerate(found.heliostat_ids):
-        values = [*found.pivot_enu_m[i], found.pdop[i], found.vdop[i]]
-        for key in names:
-            values += [found.rms_mrad[key][i], found.worst_mrad[key][i]]
-        if found.sight is not None:
-            values += [found.sight.seen_mean[:, i].mean(), found.sight.seen_least[:, i].min()]
-        writer.writerow([name, *(f"{v:.6g}" for v in values)])
-    write_atomically(path, text.getvalue().encode())
-
-
-def draw_layout_map(found: LayoutMap, path: str | Path, *, estimator: str | None = None) -> None:
-    """Draw the field from above, each heliostat in the colour of its normal's bound.
-
-    Raises
-    ------
-    InvalidInputError
-        ``path`` ends neither in .png nor in .svg.
-    """
-    name = estimator or next(iter(found.rms_mrad))
+def _drawn(found: LayoutMap, name: str) -> Figure:
     mrad = found.rms_mrad[name]
-    figure, axes = _new_figure(8.4, 7.2)
+    figure, axes = new_figure(8.4, 7.2)
     solved = np.isfinite(mrad)
     size = float(np.clip(4000.0 / len(mrad), 6.0, 90.0))
     x, y = found.pivot_enu_m[:, :2].T
@@ -345,7 +362,7 @@ def draw_layout_map(found: LayoutMap, path: str | Path, *, estimator: str | None
     figure.colorbar(dots, ax=axes, label=f"bound of the mirror normal{postures} [mrad]", shrink=0.85)
     if not solved.all():
         axes.scatter(x[~solved], y[~solved], s=size, marker="x", color="k", label="undetermined")
-    _mark(axes, found.scenario.transmitter_enu_m, found.scenario.transmitter_ids, marker="^", label="transmitter")
+    mark_places(axes, found.scenario.transmitter_enu_m, found.scenario.transmitter_ids, marker="^", label="transmitter")
     axes.set_xlabel("east [m]")
     axes.set_ylabel("north [m]")
     axes.set_aspect("equal")
@@ -353,4 +370,4 @@ def draw_layout_map(found: LayoutMap, path: str | Path, *, estimator: str | None
     seen = "\n(what each receiver sees past plates and tower)" if found.sight is not None else ""
     axes.set_title(f"{found.scenario.name}: {name}, RMS {summarise(mrad)['rms']:.3g} mrad over the field{seen}")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    _save(figure, path)
+    return figure

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.errors import GeometryError, InvalidInputError, ScenarioError
-from rfpose.files import write_atomically
-from rfpose.layout.fields import read_positions
+from rfpose.drawing import new_figure
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.layout import maps
+from rfpose.layout import optimise as search
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.optimise import (
     Constraints,
@@ -23,24 +22,17 @@ from rfpose.layout.optimise import (
     Placement,
     Zone,
     evaluate_placement,
-    optimise,
-    pareto,
-    scenario_with,
 )
 from rfpose.measurement import noise_of
-from rfpose.pipeline.layout.site import Postures, Sun, load_site, postures_of, stacked
-from rfpose.pipeline.pictures import _new_figure, _save
-from rfpose.scenario import Scenario
+from rfpose.pipeline.layout.site import Field, Postures, Site, Sun, load_site, postures_of, stacked
+from rfpose.scenario import Scenario, naming, read_positions
+from rfpose.shown import Shown, number
+from rfpose.tables import Tabled
 
-__all__ = [
-    "Rules",
-    "SitePlacement",
-    "SitePlacements",
-    "draw_placements",
-    "optimise_layout",
-    "pareto_layout",
-    "write_placements_csv",
-]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Rules", "SitePlacement", "SitePlacements", "optimise", "pareto"]
 
 _SEPARATION = 0.05
 """Towers keep this share of the radius from each other, unless told otherwise."""
@@ -48,7 +40,7 @@ _SEPARATION = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """Where towers may stand, for `optimise_layout`; all [m].
+    """Where towers may stand, for `optimise`; all [m].
 
     Attributes
     ----------
@@ -79,13 +71,15 @@ class Rules:
         """Return the rules with defaults taken from the transmitters as they stand."""
         own_radius = float(np.hypot(transmitter_enu_m[:, 0], transmitter_enu_m[:, 1]).max())
         radius = own_radius if self.radius_m is None else self.radius_m
-        for name, value in (("--radius", self.radius_m), ("--separation", self.separation_m)):
+        for name, value in (("radius_m", self.radius_m), ("separation_m", self.separation_m)):
             if value is not None and not 0.0 <= value < np.inf:
                 raise InvalidInputError(f"`{name}` must be a number of metres, not negative, got {value}")
         if not 0.0 <= self.clearance_m < np.inf:
-            raise InvalidInputError(f"`--clearance` must be a number of metres, not negative, got {self.clearance_m}")
+            raise InvalidInputError(f"`clearance_m` must be a number of metres, not negative, got {self.clearance_m}")
         if self.height_m is not None and not self.height_m[0] <= self.height_m[1]:
-            raise InvalidInputError(f"`--height` LOW HIGH must be in this order, got {self.height_m}")
+            raise InvalidInputError(
+                f"`height_m` must be the lowest and the highest, in this order, got {self.height_m}"
+            )
         heights = (float(transmitter_enu_m[:, 2].min()), float(transmitter_enu_m[:, 2].max()))
         ground = Zone(radius_m=radius)
         if self.outline_csv is not None:
@@ -99,8 +93,8 @@ class Rules:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SitePlacement:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SitePlacement(Shown):
     """Transmitters placed anew: the placement, the scenario with it, and what it was before."""
 
     placement: Placement
@@ -128,9 +122,24 @@ class SitePlacement:
             "transmitters": {t.id: list(t.position_enu_m) for t in self.scenario.transmitter},
         }
 
+    def headline(self) -> str:
+        """Return what was minimised, and how far."""
+        found = self.as_dict()
+        now = f"{number(found['value'], 4)} {found['unit']}".rstrip()
+        return f"{self.scenario.name!r}: {found['criterion']} {found['statistic']} {now}, was {found['before']:.4g}"
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SitePlacements:
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return the transmitters' places."""
+        rows = [[t.id, *(f"{x:.3f}" for x in t.position_enu_m)] for t in self.scenario.transmitter]
+        return ["transmitter", "east [m]", "north [m]", "up [m]"], rows
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the scenario with the new places; see `Scenario.save`."""
+        self.scenario.save(path, force=force)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class SitePlacements(Shown, Tabled):
     """The best placement for each number of transmitters, and whether none beats it in cost, accuracy and loss."""
 
     scenario: Scenario
@@ -156,6 +165,30 @@ class SitePlacements:
             ],
         }
 
+    def headline(self) -> str:
+        """Return which scenario, and how many numbers of transmitters."""
+        return f"{self.scenario.name!r}: {len(self.found)} numbers of transmitters"
+
+    def figures(self) -> tuple[list[str], list[list[str]]]:
+        """Return one row a number of transmitters."""
+        header, rows = self.table()
+        return header, [[number(float(value), 4) for value in row] for row in rows]
+
+    def table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a number of transmitters."""
+        summary = self.as_dict()
+        unit = f"_{summary['unit']}" if summary["unit"] else ""
+        name = f"{summary['criterion']}_{summary['statistic']}"
+        header = ["transmitters", "cost", f"{name}{unit}", f"{name}_without_worst{unit}", "efficient"]
+        keys = ("cost", "value", "without_worst")
+        return header, [
+            [row["transmitters"], *(row[key] for key in keys), int(row["efficient"])] for row in summary["placements"]
+        ]
+
+    def plot(self) -> Figure:
+        """Draw accuracy, whole and with the worst transmitter lost, against number and cost of transmitters."""
+        return _drawn(self)
+
 
 def _factor(placement: Placement) -> float:
     return 1.0 if placement.criterion == "pdop" else 1e3
@@ -171,27 +204,23 @@ class _Task:
     sigma_m: float
 
 
-def _task(
-    scenario_path: str | Path,
-    rules: Rules,
-    criterion: Criterion,
-    postures: Postures,
-    field_csv: str | Path | None,
-) -> _Task:
-    scenario = load_site(scenario_path, field_csv)
+def _task(site: Site, field: Field, rules: Rules, criterion: Criterion, postures: Postures) -> _Task:
+    scenario = load_site(site, field)
     now = scenario.transmitter_enu_m
-    if not 0 <= rules.keep <= len(now):
-        raise ScenarioError(f"{scenario_path}: cannot keep {rules.keep} transmitters, the scenario has {len(now)}")
+    with naming(site):
+        if not 0 <= rules.keep <= len(now):
+            raise ScenarioError(f"cannot keep {rules.keep} transmitters, the scenario has {len(now)}")
+        studied = stacked([p.mirrors for p in postures_of(scenario, postures)])
     return _Task(
         scenario=scenario,
-        field=stacked([p.mirrors for p in postures_of(scenario, postures, scenario_path)]),
+        field=studied,
         constraints=rules.constraints(now),
         sigma_m=1.0 if criterion == "pdop" else _sigma_m(scenario),
     )
 
 
-def optimise_layout(
-    scenario_path: str | Path,
+def optimise(
+    scenario: Site,
     *,
     n_transmitter: int | None = None,
     criterion: Criterion = "pdop",
@@ -200,7 +229,7 @@ def optimise_layout(
     costs: Costs | None = None,
     suns_deg: Sequence[Sun] = (),
     postures: Postures | None = None,
-    field_csv: str | Path | None = None,
+    field: Field = None,
     starts: int = 30,
     seed: int = 0,
     on_progress: Callable[[int, int], None] | None = None,
@@ -209,23 +238,34 @@ def optimise_layout(
 
     Parameters
     ----------
+    scenario, field
+        As in `layout_map`.
     n_transmitter
         As many as the scenario has, by default.
     rules
         Where they may stand.
     suns_deg, postures
-        As in `map_layout`.
+        As in `layout_map`.
 
     Raises
     ------
     ScenarioError
-        As `map_layout`; constraints that cannot be met.
+        As `layout_map`; constraints that cannot be met.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> better = rf.optimise(rf.shipped_scenario("table2_100m.toml"), starts=2)
+    >>> better.after_pdop < better.before_pdop
+    True
+    >>> len(better.scenario.transmitter)
+    10
     """
     rules = rules or Rules()
-    task = _task(scenario_path, rules, criterion, postures or Postures(suns_deg=suns_deg), field_csv)
+    task = _task(scenario, field, rules, criterion, postures or Postures(suns_deg=suns_deg))
     now = task.scenario.transmitter_enu_m
-    try:
-        found = optimise(
+    with naming(scenario):
+        found = search.optimise(
             n_transmitter or len(now),
             task.field,
             task.constraints,
@@ -238,9 +278,7 @@ def optimise_layout(
             seed=seed,
             progress=on_progress,
         )
-        better = scenario_with(task.scenario, found.transmitter_enu_m, n_existing=rules.keep)
-    except GeometryError as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
+        better = task.scenario.with_transmitters(maps.check_site(found.transmitter_enu_m), keep=rules.keep)
     return SitePlacement(
         placement=found,
         scenario=better,
@@ -250,8 +288,8 @@ def optimise_layout(
     )
 
 
-def pareto_layout(
-    scenario_path: str | Path,
+def pareto(
+    scenario: Site,
     counts: Sequence[int],
     *,
     criterion: Criterion = "pdop",
@@ -259,7 +297,7 @@ def pareto_layout(
     rules: Rules | None = None,
     costs: Costs | None = None,
     postures: Postures | None = None,
-    field_csv: str | Path | None = None,
+    field: Field = None,
     starts: int = 30,
     seed: int = 0,
     on_progress: Callable[[int, int], None] | None = None,
@@ -270,19 +308,19 @@ def pareto_layout(
     ----------
     counts
         Numbers of transmitters, those kept included.
-    criterion, statistic, rules, costs, postures, field_csv, starts, seed
-        As in `optimise_layout`.
+    scenario, criterion, statistic, rules, costs, postures, field, starts, seed
+        As in `optimise`.
 
     Raises
     ------
     ScenarioError
-        As `optimise_layout`.
+        As `optimise`.
     """
     rules = rules or Rules()
-    task = _task(scenario_path, rules, criterion, postures or Postures(), field_csv)
+    task = _task(scenario, field, rules, criterion, postures or Postures())
     now = task.scenario.transmitter_enu_m
-    try:
-        found = pareto(
+    with naming(scenario):
+        found = search.pareto(
             counts,
             task.field,
             task.constraints,
@@ -295,8 +333,6 @@ def pareto_layout(
             starts=starts,
             seed=seed,
         )
-    except GeometryError as error:
-        raise ScenarioError(f"{scenario_path}: {error}") from error
     return SitePlacements(scenario=task.scenario, found=tuple(found))
 
 
@@ -306,32 +342,11 @@ def _sigma_m(scenario: Scenario) -> float:
     return float(np.mean((tone**-2.0).sum(axis=0)) ** -0.5)
 
 
-def write_placements_csv(curve: SitePlacements, path: str | Path) -> None:
-    """Write one row a number of transmitters."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    summary = curve.as_dict()
-    unit = f"_{summary['unit']}" if summary["unit"] else ""
-    name = f"{summary['criterion']}_{summary['statistic']}"
-    writer.writerow(["transmitters", "cost", f"{name}{unit}", f"{name}_without_worst{unit}", "efficient"])
-    for row in summary["placements"]:
-        values = [f"{row[key]:.6g}" for key in ("cost", "value", "without_worst")]
-        writer.writerow([row["transmitters"], *values, int(row["efficient"])])
-    write_atomically(path, text.getvalue().encode())
-
-
-def draw_placements(curve: SitePlacements, path: str | Path) -> None:
-    """Draw accuracy, whole and with the worst transmitter lost, against number and cost of transmitters.
-
-    Raises
-    ------
-    InvalidInputError
-        ``path`` ends neither in .png nor in .svg.
-    """
+def _drawn(curve: SitePlacements) -> Figure:
     summary = curve.as_dict()
     rows = summary["placements"]
     count = [row["transmitters"] for row in rows]
-    figure, axes = _new_figure(8.0, 5.4)
+    figure, axes = new_figure(8.0, 5.4)
     axes.plot(count, [row["value"] for row in rows], "o-", color="#0072B2", label="all transmitters")
     lost = np.array([row["without_worst"] for row in rows], np.float64)
     axes.plot(count, np.where(np.isfinite(lost), lost, np.nan), "s--", color="#D55E00", label="the worst one lost")
@@ -350,4 +365,4 @@ def draw_placements(curve: SitePlacements, path: str | Path) -> None:
     axes.grid(alpha=0.3)
     axes.legend()
     axes.set_title(f"{curve.scenario.name}: accuracy against number of transmitters")
-    _save(figure, path)
+    return figure

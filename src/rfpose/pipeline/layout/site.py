@@ -8,20 +8,25 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.errors import GeometryError, ScenarioError
+from rfpose.errors import ScenarioError
 from rfpose.feedback.sun import Site as SunSite
 from rfpose.feedback.sun import sun_position
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.fields import read_positions, with_field
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.sight import Plates, Tower
 from rfpose.multilat import check_unambiguous
-from rfpose.scenario import Scenario, check_scenario, load_scenario
+from rfpose.scenario import Scenario, naming, scenario_of
 
-__all__ = ["Posture", "Postures", "Sight", "Sun", "load_site", "postures_of", "stacked"]
+__all__ = ["Field", "Posture", "Postures", "Sight", "Site", "Sun", "load_site", "postures_of", "stacked"]
+
+Site = Scenario | str | Path
+"""A scenario, or the file of one."""
+Field = str | Path | npt.ArrayLike | None
+"""Pivots (heliostat, xyz) [m] instead of the scenario's, or a CSV file of them."""
 
 Sun = tuple[float, float]
 
@@ -68,81 +73,60 @@ class Sight:
     tower: Tower | None = None
 
 
-def load_site(path: str | Path, field_csv: str | Path | None, *, settings: dict[str, str] | None = None) -> Scenario:
-    """Return a scenario fit for layout studies, with the heliostats of a CSV file if one is given.
+def load_site(site: Site, field: Field = None) -> Scenario:
+    """Return a scenario fit for layout studies, with another field if one is given.
 
     Parameters
     ----------
-    path, field_csv
-        TOML; see `rfpose.layout.fields.read_positions`.
-    settings
-        Replace entries of ``[budget]``.
+    site, field
+        See `Site`, `Field` and `Scenario.with_field`.
 
     Raises
     ------
     ScenarioError
-        The scenario or CSV is bad; transmitters too few, on a line or plane; heliostats on each other or on a
-        transmitter; the field wider than the longest tone resolves; the message begins with the file.
+        The scenario or field is bad; transmitters too few, on a line or plane; heliostats on each other or on a
+        transmitter; the field wider than the longest tone resolves; the message begins with the file, if there is one.
     """
-    scenario = load_scenario(path)
-    if field_csv is not None:
-        try:
-            scenario = with_field(scenario, *read_positions(field_csv))
-        except ScenarioError as error:
-            at = f"{path}, field of {field_csv}: "
-            raise ScenarioError(str(error) if str(error).startswith(str(field_csv)) else f"{at}{error}") from error
-    if settings:
-        data = scenario.model_dump(exclude_none=True)
-        data["budget"] = {**data.get("budget", {}), **settings}
-        scenario = check_scenario(data)
-    try:
+    scenario = scenario_of(site)
+    if field is not None:
+        scenario = scenario.with_field(field)
+    with naming(site):
         check_unambiguous(maps.check_site(scenario.transmitter_enu_m), scenario.wavelength_m)
         maps.check_clear(scenario)
-    except GeometryError as error:
-        raise ScenarioError(f"{path}: {error}") from error
     return scenario
 
 
-def postures_of(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Posture]:
+def postures_of(scenario: Scenario, wanted: Postures) -> list[Posture]:
     """Return the postures to study.
 
     Raises
     ------
-    ScenarioError
+    ScenarioError, GeometryError
         A date without the site's latitude and longitude; a sun without an aim point; a day without sun.
     """
-    try:
-        found = _suns(scenario, wanted, path)
-        if wanted.stow:
-            found.append(Posture(name="stow", mirrors=maps.mirrors_of(scenario, normal_enu=[0.0, 0.0, 1.0])))
-    except GeometryError as error:
-        raise ScenarioError(f"{path}: {error}") from error
-    return found
-
-
-def _suns(scenario: Scenario, wanted: Postures, path: str | Path) -> list[Posture]:
     suns = [(f"sun {az:g} {el:g}", (az, el)) for az, el in wanted.suns_deg]
     if wanted.day is not None:
-        suns += _suns_of_day(scenario, wanted.day, _DAY_STEP_MIN, path)
+        suns += _suns_of_day(scenario, wanted.day, _DAY_STEP_MIN)
     if wanted.year is not None:
         for month in range(1, 13):
-            suns += _suns_of_day(scenario, date(wanted.year, month, 21), _YEAR_STEP_MIN, path)
+            suns += _suns_of_day(scenario, date(wanted.year, month, 21), _YEAR_STEP_MIN)
     if (wanted.day is not None or wanted.year is not None) and not suns:
-        raise ScenarioError(f"{path}: the sun stays below {_LOWEST_SUN_DEG:g}° on that day; choose another")
-    if not suns and not wanted.stow:
-        return [Posture(name=maps.posture_name(scenario), mirrors=maps.mirrors_of(scenario))]
-    return [Posture(name=name, mirrors=maps.mirrors_of(scenario, sun_enu=_direction(sun))) for name, sun in suns]
+        raise ScenarioError(f"the sun stays below {_LOWEST_SUN_DEG:g}° on that day; choose another")
+    found = [Posture(name=name, mirrors=maps.mirrors_of(scenario, sun_enu=_direction(sun))) for name, sun in suns]
+    if wanted.stow:
+        found.append(Posture(name="stow", mirrors=maps.mirrors_of(scenario, normal_enu=[0.0, 0.0, 1.0])))
+    return found or [Posture(name=maps.posture_name(scenario), mirrors=maps.mirrors_of(scenario))]
 
 
 def _direction(sun_deg: Sun) -> FloatArray:
     return enu_from_azimuth_elevation(np.radians(sun_deg[0]), np.radians(sun_deg[1]))
 
 
-def _suns_of_day(scenario: Scenario, day: date, step_min: int, path: str | Path) -> list[tuple[str, Sun]]:
+def _suns_of_day(scenario: Scenario, day: date, step_min: int) -> list[tuple[str, Sun]]:
     """Suns of one day, midnight to midnight by the site's own sun, above the lowest useful elevation."""
     site = scenario.site
     if site.latitude_deg is None or site.longitude_deg is None:
-        raise ScenarioError(f"{path}: a date needs [site] `latitude_deg` and `longitude_deg`; add them, or give --sun")
+        raise ScenarioError("a date needs [site] `latitude_deg` and `longitude_deg`; add them, or give `suns_deg=`")
     midnight = datetime(day.year, day.month, day.day, tzinfo=UTC) - timedelta(hours=site.longitude_deg / 15.0)
     times = [midnight + timedelta(minutes=m) for m in range(0, 24 * 60, step_min)]
     place = SunSite(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,8 @@ from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
 from rfpose.measurement import SCENARIO, Noise, first_snr
 from rfpose.multilat.tones import MAX_TONE, Share, ToneDesign, design_tones
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.pipeline.layout.site import Site
+from rfpose.scenario import Scenario, naming, scenario_of
 
 __all__ = ["SiteTones", "design_site_tones"]
 
@@ -62,13 +62,13 @@ def _check_wishes(
 ) -> None:
     """Refuse what nobody can wish for, by the names that the command line has for it."""
     if not 0.0 < accuracy_mrad < np.inf:
-        raise InvalidInputError(f"`--accuracy-mrad` must be a number greater than zero, got {accuracy_mrad}")
+        raise InvalidInputError(f"`accuracy_mrad` must be a number greater than zero, got {accuracy_mrad}")
     if not 0.0 < success < 1.0:
-        raise InvalidInputError(f"`--success` must lie between 0 and 1, got {success}")
+        raise InvalidInputError(f"`success` must lie between 0 and 1, got {success}")
     if band_hz is not None and not 0.0 <= band_hz[0] < band_hz[1]:
-        raise InvalidInputError(f"`--band` LOW HIGH must begin at 0 Hz or above and end higher, got {band_hz}")
+        raise InvalidInputError(f"`band_hz` must begin at 0 Hz or above and end higher, got {band_hz}")
     if n_tone is not None and not 1 <= n_tone <= MAX_TONE:
-        raise InvalidInputError(f"`--tones` must lie between 1 and {MAX_TONE}, got {n_tone}")
+        raise InvalidInputError(f"`n_tone` must lie between 1 and {MAX_TONE}, got {n_tone}")
 
 
 def _by_carriers(scenario: Scenario, accuracy_mrad: float) -> str:
@@ -84,12 +84,12 @@ def _by_carriers(scenario: Scenario, accuracy_mrad: float) -> str:
         return ""
     return (
         f"; or leave it to the carriers, which `rfpose process` compares besides tones: {reached:.3g} mrad with the "
-        "scenario's own tones (`rfpose layout map --estimator scenario`), where their whole wavelengths are found"
+        "scenario's own tones (estimator `scenario` of a layout map), where their whole wavelengths are found"
     )
 
 
 def design_site_tones(
-    scenario_path: str | Path,
+    scenario: Site,
     *,
     accuracy_mrad: float,
     success: float = 1.0 - 1e-6,
@@ -106,8 +106,8 @@ def design_site_tones(
 
     Parameters
     ----------
-    scenario_path
-        TOML; its own tones matter for nothing but the first one's modulation index.
+    scenario
+        The site, or its TOML file; its own tones matter for nothing but the first one's modulation index.
     accuracy_mrad
         Wanted rms of the normal's bound over the field [mrad].
     success
@@ -125,12 +125,12 @@ def design_site_tones(
     Raises
     ------
     InvalidInputError
-        A wish out of its range, by its name on the command line.
+        A wish out of its range.
     ScenarioError
-        The scenario is bad, or no tones do; the message begins with the file.
+        The scenario is bad, or no tones do; the message begins with the file, if there is one.
     """
     _check_wishes(accuracy_mrad, success, band_hz, n_tone)
-    scenario = load_scenario(scenario_path)
+    site, scenario = scenario, scenario_of(scenario)
     snr = first_snr(scenario, tone_snr_db)
     try:
         transmitter = maps.check_site(scenario.transmitter_enu_m)
@@ -155,7 +155,8 @@ def design_site_tones(
             shown=(1e3 * rad_per_m, "mrad of the normal"),
         )
     except (GeometryError, InvalidInputError) as error:
-        raise ScenarioError(f"{scenario_path}: {error}{_by_carriers(scenario, accuracy_mrad)}") from error
+        with naming(site):
+            raise ScenarioError(f"{error}{_by_carriers(scenario, accuracy_mrad)}") from error
     index = scenario.tone[0].modulation_index
     return SiteTones(
         scenario=scenario.name,

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from rfpose.errors import RfposeError
 from rfpose.pipeline.field_view import FieldPicture, field_of_result, field_of_scenario
 from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import is_result, read_result
+from rfpose.pipeline.result_file import is_result, open_result
 from rfpose.pipeline.spectra import SharedRecording, viewing_frames
-from rfpose.pipeline.track_file import is_track, read_track
+from rfpose.pipeline.track_file import is_track, open_track
 from rfpose.pipeline.track_view import TrackPicture, picture_of_track
 from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario, load_scenario
@@ -99,7 +99,7 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None, 
     if path.is_file() and is_result(path):
         return _result(path)
     if path.is_file() and is_track(path):
-        track = read_track(path)
+        track = open_track(path)
         return Document(
             path=path,
             kind="track",
@@ -142,7 +142,7 @@ def _recording(recording: Recording) -> Document:
 
 
 def _result(path: Path) -> Document:
-    result = read_result(path)
+    result = open_result(path)
     recording: Recording | None = None
     notes: tuple[str, ...] = ()
     starts, n_sample = _none(), 0

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.jit import load_numba
 from rfpose.scenario import Receiver, Scenario
-from rfpose.simulate import _draws, _kernels, _motion, _rays
+from rfpose.simulator import _draws, _kernels, _motion, _rays
 from rfpose.truth import Truth
 
 __all__ = ["CHUNK_SAMPLES", "Chunk", "Simulator"]
@@ -176,6 +177,35 @@ class Simulator:
                     yield from ahead.popleft().result()
             while ahead:
                 yield from ahead.popleft().result()
+
+    def stretches(self, receiver_id: str) -> npt.NDArray[np.int64]:
+        """Return (stretch, 2) rows [start index, count] of what a receiver records, each within one frame."""
+        i_receiver, n_sample = self.receiver_ids.index(receiver_id), self._scenario.radio.frame_samples
+        rows = [
+            (int(start) + first, stop - first)
+            for i_frame, start in enumerate(self.frame_start_index)
+            for first, stop in _kept_stretches(0, n_sample, self._lost.get((i_frame, i_receiver), []))
+        ]
+        return np.array(rows, np.int64).reshape(-1, 2)
+
+    def pieces(self, receiver_id: str, start_index: int, count: int) -> Iterator[Callable[[], tuple[int, Samples]]]:
+        """Yield what makes the samples of a part of one stretch, piece by piece, on whichever thread.
+
+        Each, when it is called, returns where its samples begin in the part, and the samples.
+        """
+        i_receiver = self.receiver_ids.index(receiver_id)
+        i_frame = int(np.searchsorted(self.frame_start_index, start_index, side="right")) - 1
+        begin = start_index - int(self.frame_start_index[i_frame])
+        range_m = _motion.ray_range_m(self._scenario, self._receiver_enu_m[i_frame])[i_receiver]
+        rays = self._rays_of(i_frame, i_receiver, range_m)
+
+        def piece(i_chunk: int) -> tuple[int, Samples]:
+            first = max(begin, i_chunk * CHUNK_SAMPLES)
+            stop = min(begin + count, (i_chunk + 1) * CHUNK_SAMPLES)
+            return first - begin, self._make(_Job(i_frame, i_receiver, i_chunk, rays, ((first, stop),)))[0].samples
+
+        for i_chunk in range(begin // CHUNK_SAMPLES, -(-(begin + count) // CHUNK_SAMPLES)):
+            yield functools.partial(piece, i_chunk)
 
     # -- one chunk ---------------------------------------------------------------------------------------
 

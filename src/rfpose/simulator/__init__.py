@@ -1,6 +1,6 @@
 """Synthetic recordings, from a time-domain sum of rays."""
 
-from rfpose.simulate._draws import Draws
-from rfpose.simulate.simulator import Chunk, Simulator
+from rfpose.simulator._draws import Draws
+from rfpose.simulator.simulator import Chunk, Simulator
 
 __all__ = ["Chunk", "Draws", "Simulator"]
