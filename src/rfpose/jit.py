@@ -9,10 +9,13 @@ a refusal, most of ``rfpose info``) does not wait for it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 __all__ = [
@@ -22,7 +25,9 @@ __all__ = [
     "kernel_inline",
     "kernel_parallel",
     "kernel_parallel_fast",
+    "kernel_rows",
     "load_numba",
+    "one_thread",
     "prange",
 ]
 
@@ -48,6 +53,15 @@ def kernel_inline(function: Function) -> Kernel:
 def kernel_parallel(function: Function) -> Kernel:
     """Compile a kernel whose ``prange`` loops run on all cores."""
     return Kernel(function, parallel=True)
+
+
+def kernel_rows(function: Function) -> Kernel:
+    """Compile a serial kernel ``f(begin, end, …)`` that does some of many rows; called as ``f(n_row, …)``.
+
+    Threads of Python share the rows out and the kernel lets go of the interpreter, so it runs on all cores as one of
+    numba's parallel loops does, but is compiled once, not three times over. It returns nothing.
+    """
+    return _Rows(function)
 
 
 def kernel_fast(function: Function) -> Kernel:
@@ -82,10 +96,62 @@ class Kernel:
 
     def __call__(self, *arguments: Any) -> Any:
         """Run the compiled function."""
+        return self._bound()(*arguments)
+
+    def _bound(self) -> Function:
         if self.compiled is None:
             _bind()
         assert self.compiled is not None
-        return self.compiled(*arguments)
+        return self.compiled
+
+
+class _Rows(Kernel):
+    """A kernel of rows ``begin`` to ``end``, called with how many there are."""
+
+    def __call__(self, n_row: int, *arguments: Any) -> None:
+        compiled = self._bound()
+        n_thread = 1 if getattr(_here, "alone", False) else load_numba().config.NUMBA_NUM_THREADS
+        n_piece = min(n_row, _PIECES * n_thread) if n_thread > 1 else 1
+        if n_piece < 2:
+            compiled(0, n_row, *arguments)
+            return
+        edges = iter([(n_row * i // n_piece, n_row * (i + 1) // n_piece) for i in range(n_piece)])
+
+        def work() -> None:
+            for begin, end in edges:  # whoever is free takes the next piece
+                compiled(begin, end, *arguments)
+
+        helping = [_pool().submit(work) for _ in range(n_thread - 1)]
+        try:
+            work()
+        finally:
+            for helper in helping:
+                if not helper.cancel():
+                    helper.result()
+
+
+_PIECES = 8  # a thread; the more, the less one waits for another at the end
+_here = threading.local()
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Run kernels of this thread on it alone: where there are few rows, others would only be waited for."""
+    before = getattr(_here, "alone", False)
+    _here.alone = True
+    try:
+        yield
+    finally:
+        _here.alone = before
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(load_numba().config.NUMBA_NUM_THREADS - 1, thread_name_prefix="rfpose-rows")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has none of the threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 _unbound: list[Kernel] = []
@@ -106,7 +172,7 @@ def _bind() -> None:
         for one in made:
             names = one.py_func.__globals__
             for name, value in list(names.items()):
-                if isinstance(value, Kernel) and value.compiled is not None:
+                if type(value) is Kernel and value.compiled is not None:  # those of rows are called from Python only
                     names[name] = value.compiled
                 elif value is prange:
                     names[name] = numba.prange

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 
 # Smallest share of an unknown's information that the others may leave before it counts as unobserved.
 FLOOR = 1e-13
@@ -37,12 +37,6 @@ class Field(NamedTuple):
     rot: Array
     range2: float
     visible: npt.NDArray[np.uint8]
-
-
-@kernel
-def span(chunk, n_chunk, n):
-    """First and past-the-last row of a piece of the work."""
-    return n * chunk // n_chunk, n * (chunk + 1) // n_chunk
 
 
 @kernel
@@ -215,9 +209,9 @@ def dop_sums(transmitter, weight, visible, point, first, n, sums):
             sums[9, k] += w[k] * z * z
 
 
-@kernel
-def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
-    """Do rows ``begin`` to ``end`` of `dop_rows`."""
+@kernel_rows
+def dop_rows(begin, end, transmitter, weight, visible, point, out):
+    """Dilution of position, plane and height of each point, (3, point), per unit of one transmitter's range sigma."""
     m, q, s = np.empty((3, 3)), np.empty((3, 3)), np.empty(4)
     sums = np.empty((10, BLOCK))
     for first in range(begin, end, BLOCK):
@@ -234,17 +228,12 @@ def dop_rows_part(begin, end, transmitter, weight, visible, point, out):
                 out[2, first + k] = math.sqrt(q[2, 2])
 
 
-@kernel_parallel
-def dop_rows(transmitter, weight, visible, point, n_chunk, out):
-    """Dilution of position, plane and height of each point, (3, point), per unit of one transmitter's range sigma."""
-    for chunk in prange(n_chunk):
-        begin, end = span(chunk, n_chunk, point.shape[0])
-        dop_rows_part(begin, end, transmitter, weight, visible, point, out)
+@kernel_rows
+def tilt_independent(begin, end, field, plane_slope, own, common, n_min, out):
+    """Variance of the normal [rad²] from fits of each receiver by itself; (mirror,).
 
-
-@kernel
-def tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, out):
-    """Do rows ``begin`` to ``end`` of `tilt_independent`."""
+    ``own``, ``common`` (group, transmitter): variances of a receiver's own noise and of the calibration's.
+    """
     n_group, n_transmitter = own.shape
     n_receiver = field.place.shape[1]
     range2, visible = field.range2, field.visible
@@ -322,17 +311,6 @@ def tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, ou
                         tz += vz
                     total += common[g, t] * (tx * tx + ty * ty + tz * tz)
         out[i] = total
-
-
-@kernel_parallel
-def tilt_independent(field, plane_slope, own, common, n_min, n_chunk, out):
-    """Variance of the normal [rad²] from fits of each receiver by itself; (mirror,).
-
-    ``own``, ``common`` (group, transmitter): variances of a receiver's own noise and of the calibration's.
-    """
-    for chunk in prange(n_chunk):
-        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
-        tilt_independent_part(begin, end, field, plane_slope, own, common, n_min, out)
 
 
 @kernel
@@ -417,9 +395,13 @@ def add_arm(ax, ay, az, m, pp, tp, tt):
     tt[2, 2] += ax * y2 - ay * x2
 
 
-@kernel
-def tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_info, out):
-    """Do rows ``begin`` to ``end`` of `tilt_calibrated`."""
+@kernel_rows
+def tilt_calibrated(begin, end, field, weight, shared, pivot_info, roll_info, out):
+    """Variance of the normal [rad²] of rigid mirrors with perfectly calibrated transmitters; (mirror,).
+
+    ``weight`` (transmitter,) is the sum over tones. Clocks, one a receiver or one a mirror (``shared``), come off as
+    means, the pivot as a block: far less arithmetic than `tilt_rigid`, and the same result.
+    """
     n_transmitter = field.transmitter.shape[1]
     n_receiver = field.place.shape[1]
     range2, visible, rot = field.range2, field.visible, field.rot
@@ -492,23 +474,14 @@ def tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_inf
             out[i] = normal_variance(q, rot[i])
 
 
-@kernel_parallel
-def tilt_calibrated(field, weight, shared, pivot_info, roll_info, n_chunk, out):
-    """Variance of the normal [rad²] of rigid mirrors with perfectly calibrated transmitters; (mirror,).
+@kernel_rows
+def tilt_rigid(begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out):
+    """Variance of the normal [rad²] of rigid mirrors; (mirror,).
 
-    ``weight`` (transmitter,) is the sum over tones. Clocks, one a receiver or one a mirror (``shared``), come off as
-    means, the pivot as a block: far less arithmetic than `tilt_rigid`, and the same result.
+    ``weight``, ``bias_info`` (group, transmitter): 1/variance of own noise and of the transmitter's own error
+    (infinite = perfectly calibrated, 0 = not at all). ``shared``: one clock a mirror and class; else one a receiver,
+    whose differences have information ``tie`` a pair.
     """
-    for chunk in prange(n_chunk):
-        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
-        tilt_calibrated_part(begin, end, field, weight, shared, pivot_info, roll_info, out)
-
-
-@kernel
-def tilt_rigid_part(
-    begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out
-):
-    """Do rows ``begin`` to ``end`` of `tilt_rigid`."""
     n_group, n_transmitter = weight.shape
     n_receiver = field.place.shape[1]
     range2, visible, rot = field.range2, field.visible, field.rot
@@ -602,18 +575,3 @@ def tilt_rigid_part(
         if not invert(m, q):
             continue
         out[i] = normal_variance(q, rot[i])
-
-
-@kernel_parallel
-def tilt_rigid(field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, n_chunk, out):
-    """Variance of the normal [rad²] of rigid mirrors; (mirror,).
-
-    ``weight``, ``bias_info`` (group, transmitter): 1/variance of own noise and of the transmitter's own error
-    (infinite = perfectly calibrated, 0 = not at all). ``shared``: one clock a mirror and class; else one a receiver,
-    whose differences have information ``tie`` a pair.
-    """
-    for chunk in prange(n_chunk):
-        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
-        tilt_rigid_part(
-            begin, end, field, weight, bias_info, group_class, n_class, shared, tie, pivot_info, roll_info, out
-        )

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.jit import load_numba
 from rfpose.layout import _kernels
 from rfpose.measurement import SCENARIO, Estimator, Noise, clock_classes, estimators_of, noise_of
 from rfpose.scenario import Heliostat, Scenario
@@ -228,9 +227,7 @@ def dilution(
     else:
         out = np.full((3, len(flat)), np.nan)
         seen = _mask(visible, (len(flat), len(transmitter)), lead)
-        _kernels.dop_rows(
-            np.ascontiguousarray(transmitter.T), np.ones(len(transmitter)), seen, flat, _chunks(len(flat)), out
-        )
+        _kernels.dop_rows(len(flat), np.ascontiguousarray(transmitter.T), np.ones(len(transmitter)), seen, flat, out)
     return Dilution(position=out[0].reshape(lead), horizontal=out[1].reshape(lead), vertical=out[2].reshape(lead))
 
 
@@ -285,8 +282,8 @@ def normal_map(
     field_seen = _field(transmitter, mirrors, range2, seen)
     if not estimator.rigid:
         _kernels.tilt_independent(
-            field_seen, _plane_slope(mirrors.receiver_mirror_m), noise.tone_sigma_m**2, noise.calibration_sigma_m**2,
-            _MIN_TRANSMITTER[3], _chunks(n_mirror), out,
+            n_mirror, field_seen, _plane_slope(mirrors.receiver_mirror_m), noise.tone_sigma_m**2,
+            noise.calibration_sigma_m**2, _MIN_TRANSMITTER[3], out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
     shared = estimator.clock_sigma_m == 0.0
@@ -294,7 +291,7 @@ def normal_map(
     own, common = noise.groups(carrier=estimator.carrier)
     if len(own) == 1 and not np.any(common > 0.0) and (shared or np.isinf(estimator.clock_sigma_m)):
         _kernels.tilt_calibrated(
-            field_seen, own[0] ** -2.0, shared, estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
+            n_mirror, field_seen, own[0] ** -2.0, shared, estimator.pivot_sigma_m**-2, roll_info, out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
     with np.errstate(divide="ignore"):
@@ -304,8 +301,8 @@ def normal_map(
     if not shared and np.isfinite(estimator.clock_sigma_m):
         tie = 1.0 / (n_receiver * estimator.clock_sigma_m**2)
     _kernels.tilt_rigid(
-        field_seen, own**-2.0, bias_info, group_class, len(own), shared, tie,
-        estimator.pivot_sigma_m**-2, roll_info, _chunks(n_mirror), out,
+        n_mirror, field_seen, own**-2.0, bias_info, group_class, len(own), shared, tie,
+        estimator.pivot_sigma_m**-2, roll_info, out,
     )  # fmt: skip
     return np.asarray(np.sqrt(out))
 
@@ -544,11 +541,6 @@ def summarise(values: FloatArray) -> dict[str, float]:
         "worst": float(finite.max()),
         "undetermined": 1.0 - finite.size / values.size,
     }
-
-
-def _chunks(n: int) -> int:
-    """Pieces to share out: one a thread for small maps, more for large ones."""
-    return max(1, min(8 * int(load_numba().get_num_threads()), n // 64 or 1))
 
 
 def _mask(visible: npt.ArrayLike | None, shape: tuple[int, ...], lead: tuple[int, ...]) -> npt.NDArray[np.uint8]:

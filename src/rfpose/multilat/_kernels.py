@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 
 IntArray = npt.NDArray[np.signedinteger[Any]]
 
@@ -510,8 +510,10 @@ def store_group(
             residual[i, t] = error[t, lane] * scale if w[t, lane] > 0.0 else np.nan
 
 
-@kernel_parallel
+@kernel_rows
 def locate_rows(
+    begin: int,
+    end: int,
     transmitter: FloatArray,
     range_difference: FloatArray,
     weight: FloatArray,
@@ -523,7 +525,6 @@ def locate_rows(
     tolerance2: float,
     relax: float,
     n_min: int,
-    n_chunk: int,
     position: FloatArray,
     clock: FloatArray,
     cov: FloatArray,
@@ -534,7 +535,7 @@ def locate_rows(
     n_iteration: IntArray,
     fate: IntArray,
 ) -> None:
-    """Locate every row of ``range_difference``.
+    """Locate the rows of ``range_difference`` in its groups ``begin`` to ``end`` of `LANES` each.
 
     ``transmitter`` and ``start`` are centred and scaled; ``transmitter`` has an even number of rows, the last of
     which may be beyond the columns of ``range_difference`` and then has no weight. ``range_difference`` is in
@@ -543,27 +544,25 @@ def locate_rows(
     """
     n = range_difference.shape[0]
     n_transmitter = transmitter.shape[0]
-    n_group = (n + LANES - 1) // LANES
-    for chunk in prange(n_chunk):
-        ws = np.zeros(WORKSPACE)
-        delta = np.zeros((n_transmitter, LANES))
-        w = np.zeros((n_transmitter, LANES))
-        error = np.empty((n_transmitter, LANES))
-        for group in range(n_group * chunk // n_chunk, n_group * (chunk + 1) // n_chunk):
-            first = group * LANES
-            n_lane = min(LANES, n - first)
-            load_group(range_difference, weight, first, n_lane, 1.0 / scale, delta, w, ws)
-            if start.shape[0] == 0:
-                start_group(transmitter, delta, w, planar, ws)
-            else:
-                start_given(start, first, n_lane, n_transmitter, delta, w, transmitter, ws)
-            iterate_group(transmitter, delta, w, planar, max_iteration, tolerance2, relax, n_min, ws)
-            dop_group(transmitter, delta, w, planar, error, ws)
-            residual_group(range_difference.shape[1], transmitter, delta, w, ws, error)
-            store_group(
-                first, n_lane, scale, centre, planar, w, error, n_min, ws,
-                position, clock, cov, dop, residual, chi2, n_seen, n_iteration, fate,
-            )  # fmt: skip
+    ws = np.zeros(WORKSPACE)
+    delta = np.zeros((n_transmitter, LANES))
+    w = np.zeros((n_transmitter, LANES))
+    error = np.empty((n_transmitter, LANES))
+    for group in range(begin, end):
+        first = group * LANES
+        n_lane = min(LANES, n - first)
+        load_group(range_difference, weight, first, n_lane, 1.0 / scale, delta, w, ws)
+        if start.shape[0] == 0:
+            start_group(transmitter, delta, w, planar, ws)
+        else:
+            start_given(start, first, n_lane, n_transmitter, delta, w, transmitter, ws)
+        iterate_group(transmitter, delta, w, planar, max_iteration, tolerance2, relax, n_min, ws)
+        dop_group(transmitter, delta, w, planar, error, ws)
+        residual_group(range_difference.shape[1], transmitter, delta, w, ws, error)
+        store_group(
+            first, n_lane, scale, centre, planar, w, error, n_min, ws,
+            position, clock, cov, dop, residual, chi2, n_seen, n_iteration, fate,
+        )  # fmt: skip
 
 
 @kernel

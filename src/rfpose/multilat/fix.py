@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -315,11 +314,10 @@ class _Problem:
         }
         even = np.concatenate([self.inside(self.transmitter), np.zeros((n_transmitter % 2, 3))])
         _kernels.locate_rows(
-            even, ranges, weight,
+            -(-n // _kernels.LANES), even, ranges, weight,
             np.empty((0, 3)) if start is None else self.inside(start),
             self.scale, self.centre, 3.0 - n_axis,
-            int(self.max_iteration / relax), STEP_TOLERANCE_SIGMA**2, relax, n_axis + 2,
-            max(1, min(8 * (os.cpu_count() or 1), n // _kernels.LANES)), *result.values(),
+            int(self.max_iteration / relax), STEP_TOLERANCE_SIGMA**2, relax, n_axis + 2, *result.values(),
         )  # fmt: skip
         return result
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel, prange
-from rfpose.layout._kernels import FLOOR, directions, invert, look, span, torque, turn_slopes
+from rfpose.jit import kernel, kernel_rows
+from rfpose.layout._kernels import FLOOR, directions, invert, look, torque, turn_slopes
 
 DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
 
 
-@kernel
-def objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient):
-    """Do rows ``begin`` to ``end`` of `objective_rows`."""
+@kernel_rows
+def objective_rows(begin, end, method, field, weight, plane_slope, value, gradient):
+    """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
+
+    ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
+    Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
+    """
     n_transmitter = field.transmitter.shape[1]
     n_receiver = 1 if method == DOP else field.place.shape[1]
     pivot, rot = field.pivot, field.rot
@@ -61,18 +65,6 @@ def objective_rows_part(begin, end, method, field, weight, plane_slope, value, g
             value[i] = weigh_rotation(cov, rot[i], weighed)
             for r in range(n_receiver):
                 add_gradient(r, 6, weight, row, u, inverse, arm, weighed, gradient[i])
-
-
-@kernel_parallel
-def objective_rows(method, field, weight, plane_slope, n_chunk, value, gradient):
-    """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
-
-    ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
-    Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
-    """
-    for chunk in prange(n_chunk):
-        begin, end = span(chunk, n_chunk, field.pivot.shape[0])
-        objective_rows_part(begin, end, method, field, weight, plane_slope, value, gradient)
 
 
 @kernel

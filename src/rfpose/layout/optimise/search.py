@@ -15,8 +15,8 @@ from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.jit import load_numba
-from rfpose.layout.maps import Mirrors, _chunks, _field, _plane_slope
+from rfpose.jit import one_thread
+from rfpose.layout.maps import Mirrors, _field, _plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
 
@@ -170,8 +170,8 @@ def _rows(
     value = np.empty(n)
     slope = np.zeros((n, len(transmitter), 3))
     _kernels.objective_rows(
-        CRITERIA[criterion], _field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
-        _plane_slope(field.receiver_mirror_m), _chunks(n), value, slope,
+        n, CRITERIA[criterion], _field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
+        _plane_slope(field.receiver_mirror_m), value, slope,
     )  # fmt: skip
     return value, slope
 
@@ -179,14 +179,8 @@ def _rows(
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Search on one core: a few hundred points and tiny matrices, where threads only wait for each other."""
-    numba = load_numba()
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        with threadpool_limits(1, user_api="blas"):
-            yield
-    finally:
-        numba.set_num_threads(before)
+    with one_thread(), threadpool_limits(1, user_api="blas"):
+        yield
 
 
 def _statistic(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:

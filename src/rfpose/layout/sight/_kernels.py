@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 
 
 @kernel
@@ -95,13 +95,14 @@ def neighbours_hide(
     return False
 
 
-@kernel_parallel
+@kernel_rows
 def visible_rows(
-    transmitter, receiver, who, centre, rot, half_x, half_y, disc, reach, top, tower, x0, y0, cell, start, member, out
-):
+    begin, end, transmitter, receiver, who, centre, rot, half_x, half_y, disc, reach, top, tower, x0, y0, cell, start,
+    member, out,
+):  # fmt: skip
     """Fill ``out`` (row, receiver, transmitter) with one where the way is free; row i belongs to plate ``who[i]``."""
-    n_row, n_receiver, n_transmitter = out.shape
-    for i in prange(n_row):
+    n_receiver, n_transmitter = out.shape[1:]
+    for i in range(begin, end):
         m = who[i]
         for r in range(n_receiver):
             ax, ay, az = receiver[i, r, 0], receiver[i, r, 1], receiver[i, r, 2]

@@ -188,7 +188,7 @@ def _free(
     if tower is not None:
         cylinder[:] = (*tower.centre_enu_m, tower.radius_m, tower.bottom_m, tower.top_m)
     _kernels.visible_rows(
-        source_enu_m, place_enu_m, who, centre, mirrors.rot_enu_from_mirror, half_x, half_y, disc, reach,
+        len(out), source_enu_m, place_enu_m, who, centre, mirrors.rot_enu_from_mirror, half_x, half_y, disc, reach,
         float(centre[:, 2].max() + reach), cylinder, float(origin[0]), float(origin[1]), cell, start, member, out,
     )  # fmt: skip
     return out.astype(np.bool_)

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 
 # fates of a row; `rfpose.multilat.ambiguity.IntegerStatus` gives them names
 OK = 0
@@ -201,10 +201,10 @@ def fix_one(n, value, cov, limit, integers, norm):
     return risk, adop, found, OK
 
 
-@kernel_parallel
-def fix_many(count, value, cov, limit, integers, norm, risk, adop, n_found, status):
+@kernel_rows
+def fix_many(begin, end, count, value, cov, limit, integers, norm, risk, adop, n_found, status):
     """`fix_one` for every row; row m has ``count[m]`` unknowns, its first ones."""
-    for m in prange(len(count)):
+    for m in range(begin, end):
         if count[m] == 0:
             status[m] = NONE
             continue
@@ -228,9 +228,24 @@ def _terms(r, i, q, r0, i0, receiver, transmitter, sign):
     return n
 
 
-@kernel_parallel
+@kernel_rows
 def difference_many(
-    left, slope, pose_cov, own_m2, common_m2, clock_m2, wavelength, minus, reference, count, value, cov, row, column
+    begin,
+    end,
+    left,
+    slope,
+    pose_cov,
+    own_m2,
+    common_m2,
+    clock_m2,
+    wavelength,
+    minus,
+    reference,
+    count,
+    value,
+    cov,
+    row,
+    column,
 ):
     """Differences of ranges whose integers are sought, in cycles, and their covariance.
 
@@ -240,7 +255,7 @@ def difference_many(
     (−1: none) and the difference of transmitter ``reference[m, r, 1]`` at receiver ``reference[m, r, 0]`` (−1: none).
     """
     n_receiver, n_transmitter = left.shape[1:]
-    for m in prange(len(left)):
+    for m in range(begin, end):
         size = n_receiver * n_transmitter
         receivers, transmitters = np.empty((size, 4), np.int64), np.empty((size, 4), np.int64)
         signs, n_term = np.empty((size, 4)), np.empty(size, np.int64)

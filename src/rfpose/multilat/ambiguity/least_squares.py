@@ -111,7 +111,7 @@ def integer_least_squares(
     norm = np.full((n_row, n_candidate), np.inf)
     risk, adop = np.ones(n_row), np.full(n_row, np.nan)
     n_found, status = np.zeros(n_row, np.int64), np.zeros(n_row, np.int64)
-    _kernels.fix_many(counts, value, cov, SEARCH_NODES, integers, norm, risk, adop, n_found, status)
+    _kernels.fix_many(n_row, counts, value, cov, SEARCH_NODES, integers, norm, risk, adop, n_found, status)
     with np.errstate(invalid="ignore"):
         odds = np.nansum(np.exp(-0.5 * (norm[:, 1:] - norm[:, :1])), axis=1)
     return IntegerSolution(

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 from rfpose.multilat.rigid._kernels import OPEN, SOLVED, STUCK, add_priors, factor, rotate, solve_factored
 
 Float64 = npt.NDArray[np.float64]
@@ -208,10 +208,10 @@ def shift_at(scene, work, x, y, z, i, out):
             out[g, 5 + c] = (1j * (even - odd) * scale).imag
 
 
-@kernel_parallel
-def shifts_at_points(scene, point, out):
+@kernel_rows
+def shifts_at_points(begin, end, scene, point, out):
     """`shift_at` for points (point, 3): ``out`` (point, transmitter, group, 4 + parameter)."""
-    for m in prange(point.shape[0]):
+    for m in range(begin, end):
         work = _work(scene.image.shape[0])
         for i in range(out.shape[1]):
             shift_at(scene, work, point[m, 0], point[m, 1], point[m, 2], i, out[m, i])
@@ -511,8 +511,10 @@ def _fit_from_turns(
     return best, total, status
 
 
-@kernel_parallel
+@kernel_rows
 def fit_many(
+    begin,
+    end,
     scene,
     mirrors,
     max_iteration,
@@ -531,8 +533,7 @@ def fit_many(
     status,
 ):
     """`_fit_from_turns` for every mirror that has a start."""
-    for index in prange(chi2.shape[0]):
-        m = np.int64(index)  # one type for both passes of the compiler
+    for m in range(begin, end):
         if status[m] == SOLVED or status[m] == OPEN or status[m] == STUCK:
             chi2[m], n_iteration[m], status[m] = _fit_from_turns(
                 scene,
@@ -552,10 +553,10 @@ def fit_many(
             )
 
 
-@kernel_parallel
-def predict_many(scene, frame, receiver_mirror, pivot, rot, predicted, slope):
+@kernel_rows
+def predict_many(begin, end, scene, frame, receiver_mirror, pivot, rot, predicted, slope):
     """`predict` for every mirror."""
-    for m in prange(pivot.shape[0]):
+    for m in range(begin, end):
         common = scene.common[frame[m]]
         work = _work(scene.image.shape[0])
         predict(scene, common, work, receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])

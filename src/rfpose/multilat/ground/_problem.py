@@ -188,7 +188,7 @@ class Problem:
             return scene
         n_transmitter, n_group, n_value = scene.common.shape[1:]
         seen = np.zeros((len(place), n_transmitter, n_group, 3 + n_value))
-        _kernels.shifts_at_points(scene, place, seen)
+        _kernels.shifts_at_points(len(place), scene, place, seen)
         tones = np.flatnonzero(scene.tone_k)
         common = np.zeros((len(self.frames), n_transmitter, n_group, n_value))
         common[:, :, tones] = self.calibration.change_m(np.delete(seen, (1, 2, 3), axis=3)[:, :, tones], self.frames)
@@ -209,6 +209,7 @@ class Problem:
         """
         n_mirror = len(state.chi2)
         _kernels.fit_many(
+            n_mirror,
             self.scene_at(parameter),
             self.mirrors,
             max_iteration,
@@ -233,7 +234,9 @@ class Problem:
         slope = np.empty((*predicted.shape, 6 + self.n_parameter))
         scene = self.scene_at(parameter)
         mirrors = self.mirrors
-        _kernels.predict_many(scene, mirrors.frame, mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope)
+        _kernels.predict_many(
+            len(state.pivot), scene, mirrors.frame, mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope
+        )
         return predicted, slope
 
     def direct(self) -> Problem:

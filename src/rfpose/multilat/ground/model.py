@@ -180,7 +180,7 @@ def range_shift_m(
         propagation_speed_mps=as_positive("propagation_speed_mps", propagation_speed_mps),
     )
     out = np.zeros((len(point), len(transmitter), len(scene.tone_k), 4))
-    _kernels.shifts_at_points(scene, point, out)
+    _kernels.shifts_at_points(len(point), scene, point, out)
     return out[..., 0]
 
 

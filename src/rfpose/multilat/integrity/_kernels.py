@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 from rfpose.multilat.rigid._kernels import factor, ranges_and_slopes, solve_factored
 
 
@@ -230,13 +230,15 @@ def _judge_one(
     return True
 
 
-@kernel_parallel
+@kernel_rows
 def judge_many(
+    begin,
+    end,
     transmitter, places, z, weight, bias_info, clock_class, prior_info, pivot, rot, clock, floor,
     data_info, data_gradient, cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,
 ):  # fmt: skip
     """`_judge_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
-    for m in prange(z.shape[0]):
+    for m in range(begin, end):
         ok[m] = _judge_one(
             transmitter, places[m], z[m], weight[m], bias_info[m], clock_class, prior_info[m], pivot[m], rot[m],
             clock[m], floor, data_info[m], data_gradient[m], cov[m], stat[m], dof[m], hidden[m], shift[m], spread[m],

@@ -189,6 +189,7 @@ def judge(problem: Problem, poses: RigidPoses) -> Verdict:
     link_dof = np.zeros((n_mirror, n_receiver, n_transmitter), np.int64)
     ok = np.zeros(n_mirror, np.bool_)
     _kernels.judge_many(
+        n_mirror,
         problem.transmitter, problem.places, problem.z, problem.weight, problem.bias_info, problem.classes, prior_info,
         np.ascontiguousarray(poses.pivot_enu_m), rot, np.ascontiguousarray(poses.clock_m), _FLOOR, data_info, gradient,
         cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,

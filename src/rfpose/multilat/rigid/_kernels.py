@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 from rfpose.multilat.status import PoseStatus
 
 SOLVED, OPEN, STUCK = int(PoseStatus.OK), int(PoseStatus.UNDETERMINED), int(PoseStatus.NOT_CONVERGED)
@@ -303,8 +303,10 @@ def _solve_one(
     return chi2, used, status
 
 
-@kernel_parallel
+@kernel_rows
 def solve_many(
+    begin,
+    end,
     transmitter,
     receiver_mirror,
     z,
@@ -328,7 +330,7 @@ def solve_many(
     status,
 ):
     """`_solve_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
-    for m in prange(z.shape[0]):
+    for m in range(begin, end):
         if status[m] != SOLVED:
             continue
         chi2[m], n_iteration[m], status[m] = _solve_one(
@@ -353,8 +355,10 @@ def solve_many(
         )
 
 
-@kernel_parallel
+@kernel_rows
 def covariance_many(
+    begin,
+    end,
     transmitter,
     receiver_mirror,
     weight,
@@ -373,7 +377,7 @@ def covariance_many(
     n_receiver = receiver_mirror.shape[1]
     n_class = clock_own.shape[1]
     n = 6 + n_class * n_receiver
-    for m in prange(weight.shape[0]):
+    for m in range(begin, end):
         distance = np.empty((n_receiver, transmitter.shape[0]))
         slope = np.empty((n_receiver, transmitter.shape[0], 6))
         info = np.zeros((n, n))

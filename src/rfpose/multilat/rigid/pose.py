@@ -86,6 +86,7 @@ def solve_rigid(problem: MirrorProblem) -> RigidPoses:
     chi2 = np.full(n_mirror, np.nan)
     n_iteration = np.zeros(n_mirror, np.int64)
     _kernels.solve_many(
+        n_mirror,
         transmitter,
         places,
         np.nan_to_num(problem.range_m),
@@ -152,6 +153,7 @@ def full_covariance(problem: MirrorProblem) -> FloatArray:
     n_unknown = 6 + problem.n_class * n_receiver
     cov = np.full((n_mirror, n_unknown, n_unknown), np.nan)
     _kernels.covariance_many(
+        n_mirror,
         problem.transmitter_enu_m,
         problem.receiver_mirror_m,
         equations.weight,

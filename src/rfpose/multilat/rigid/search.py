@@ -142,7 +142,7 @@ def search_integers(
         count, value, cov = np.zeros(n, np.int64), np.zeros((n, size)), np.zeros((n, size, size))
         row, column = np.zeros((n, size), np.int64), np.zeros((n, size), np.int64)
         _kernels.difference_many(
-            left, prediction.slope, prediction.cov, own_m2, common, clock_m2, wavelength_m, minus, reference,
+            n, left, prediction.slope, prediction.cov, own_m2, common, clock_m2, wavelength_m, minus, reference,
             count, value, cov, row, column,
         )  # fmt: skip
         return count, value, cov, row, column

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_rows
 from rfpose.multilat.rigid._kernels import rotate
 
 N = 9
@@ -228,14 +228,15 @@ def step_frame(
     return UPDATED, distance, 0
 
 
-@kernel_parallel
+@kernel_rows
 def track_many(
+    begin, end,
     measured_pivot, measured_rot, noise, usable, exposure, walk_rate, walk_pivot, rate_variance, limits, max_coast,
     restart_after, delay, time, times, counts, pivot, rot, rate, cov, out_pivot, out_rot, out_rate, out_cov, status,
     distance, parts,
 ):  # fmt: skip
     """`step_frame` for every frame of every mirror; results ``delay`` after each frame's ``time``."""
-    for m in prange(measured_pivot.shape[1]):
+    for m in range(begin, end):
         for f in range(len(time)):
             status[f, m], distance[f, m], parts[f, m] = step_frame(
                 measured_pivot[f, m], measured_rot[f, m], noise[f, m], usable[f, m], exposure, walk_rate, walk_pivot,

@@ -235,6 +235,7 @@ def track_poses(
     out = [np.full((*shape, *a.shape[1:]), np.nan) for a in now]
     status, parts, distance = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.full(shape, np.nan)
     _kernels.track_many(
+        n_mirror,
         pivot,
         rot,
         noise,
