@@ -159,7 +159,7 @@ def between():
 def normal_rate_radps(simulation):
     """How fast the wanted normals turn, rms over mirrors and steps."""
     day = simulation.days[0]
-    here, later = (simulation.wanted_normal_enu(day, i) for i in (900, 901))
+    here, later = (simulation.plant.wanted_normal_enu(day, i) for i in (900, 901))
     return np.sqrt(np.mean(np.sum((later - here) ** 2, axis=1)))
 
 
@@ -280,7 +280,7 @@ def test_light_by_mode_adds_up_to_what_the_emergency_cost(emergency, method):
     assert by_mode[Mode.STOW, 2] == 0.0
     # offered: beam times the cosine at the wanted normal, by another path
     cosine = np.array([
-        np.mean(emergency.wanted_normal_enu(day, s) @ day.sun_enu[s]) for s in range(0, len(day.unix_s), 4)
+        np.mean(emergency.plant.wanted_normal_enu(day, s) @ day.sun_enu[s]) for s in range(0, len(day.unix_s), 4)
     ])  # fmt: skip
     offered = day.power_w_per_m2[::4] * cosine * 4.0
     # on the receiver it is counted as mirrors stand: some mrad of error are some 1e-4 of the cosine

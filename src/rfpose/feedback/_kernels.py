@@ -223,14 +223,16 @@ def _count_guess(a, angle, p, k, prepared):
 
 @kernel
 def _worm(p, k, a, angle):
-    """How far a worm gear has to turn its axis for the axis to be at an angle: Newton's method."""
+    """How far a worm gear has to turn its axis for the axis to be at an angle.
+
+    By substitution, which stays bounded: a rolling fit may believe in a gear for which Newton's method runs away.
+    """
     sine, cosine, ratio = p[P.worm_1_sin_rad + 2 * a], p[P.worm_1_cos_rad + 2 * a], k[K.worm_ratio + a]
     worm = 0.0
     if sine == 0.0 and cosine == 0.0:
         return worm
-    for _ in range(5):
-        s, c = math.sin(ratio * (angle - worm)), math.cos(ratio * (angle - worm))
-        worm -= (worm - sine * s - cosine * c) / (1.0 + ratio * (sine * c - cosine * s))
+    for _ in range(8):
+        worm = sine * math.sin(ratio * (angle - worm)) + cosine * math.cos(ratio * (angle - worm))
     return worm
 
 
