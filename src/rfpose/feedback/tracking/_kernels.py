@@ -1,7 +1,8 @@
 """Kernels of the tracking loop: one mirror after the other, each through all steps of a stretch of time.
 
-The mount's parameters ``p`` and constants ``k`` are those of `rfpose.feedback._kernels`. Step g of a day is its g-th
-servo interval, step s of a stretch is step ``step0 + s`` of the day. Everything random is drawn outside and handed in.
+The mount's parameters ``p`` and constants ``k`` are those of `rfpose.feedback._kernels`. Its kernels are compiled into
+these: once it has changed, a cache of this module is stale. Step g of a day is its g-th servo interval, step s of a
+stretch is step ``step0 + s`` of the day. Everything random is drawn outside and handed in.
 """
 
 from __future__ import annotations
