@@ -1,4 +1,4 @@
-"""What the estimators begin with: the problem that one group of mirrors poses, made of the stages before."""
+"""From the stages before to the problem that one group of mirrors poses, and to the estimator that solves it."""
 
 from __future__ import annotations
 
