@@ -9,15 +9,16 @@ from such a recording to the mirrors' normals, on a simulated one: then what is 
 # %%
 # A site is a TOML file: transmitters, tones, mirrors with the places of their receivers, calibration receivers. Table 2
 # of the paper, on a field of 100 m, comes with rfpose. ``changed`` gives the same site with other numbers: here four
-# mirrors, short frames, and a ground that throws a fifth of each ray back.
+# mirrors whose pivots are surveyed to 5 mm, and short frames.
 import rfpose as rf
 
 site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
 site = site.changed(
-    heliostat=[h.model_dump(exclude_none=True) | {"pivot_sigma_m": 0.005} for h in site.heliostat[:4]],
+    heliostat=site.heliostat[:4],
     radio={"frame_samples": 40_000},
     simulation={"frame_count": 6, "frame_interval_s": 1.0, "tone_snr_db": 35.0},
 )
+site = site.changed(heliostat={"pivot_sigma_m": 0.005})
 site
 
 # %%

@@ -39,7 +39,7 @@ def test_table_names_alarms_and_files(tmp_path):
     assert written["heliostat"]["BE61"]["actuators"][0]["kind"] == "linear"
     again = CliRunner().invoke(command, [str(PAINT), "--heliostat", "BE61", "-o", str(model)])
     assert isinstance(again.exception, RecordingError)
-    assert "--force" in str(again.exception)
+    assert "`force=True`" in str(again.exception)
 
 
 @needs_paint

@@ -40,15 +40,13 @@ def _json(*arguments: object) -> dict[str, Any]:
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a site, its recording and the result, made by the commands."""
     where = tmp_path_factory.mktemp("field")
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:2]
-    data["radio"]["frame_samples"] = 8000
-    data["simulation"] |= {
-        "frame_count": 2,
-        "sun_azimuth_deg": 170.0,
-        "blocked": [{"transmitter": f"T{i}", "receivers": ["H02"], "first_frame": 1} for i in range(1, 7)],
-    }
-    (where / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    shipped = load_scenario(shipped_scenario("table2_100m.toml"))
+    blocked = [{"transmitter": f"T{i}", "receivers": ["H02"], "first_frame": 1} for i in range(1, 7)]
+    shipped.changed(
+        heliostat=shipped.heliostat[:2],
+        radio={"frame_samples": 8000},
+        simulation={"frame_count": 2, "sun_azimuth_deg": 170.0, "blocked": blocked},
+    ).save(where / "site.toml")
     summary = _json("simulate", where / "site.toml", "-o", where / "rec.h5", "--seed", 4)
     assert summary["frames"] == 2
     assert summary["bytes"] == (where / "rec.h5").stat().st_size
@@ -95,9 +93,7 @@ def test_info(directory: Path, name: str, kind: str) -> None:
 
 
 def test_info_on_a_site_that_cannot_be_solved(directory: Path, tmp_path: Path) -> None:
-    data = load_scenario(directory / "site.toml").model_dump(exclude_none=True)
-    data["tone"][0]["frequency_hz"] = 1.5e6
-    (tmp_path / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    load_scenario(directory / "site.toml").changed(tone={"frequency_hz": 1.5e6}).save(tmp_path / "site.toml")
     found = _json("info", tmp_path / "site.toml")
     assert not found["sound"]
     assert "ambiguous" in found["problems"][0]
@@ -112,7 +108,7 @@ def test_convert_there_and_back(directory: Path, tmp_path: Path) -> None:
     assert there.truth is None
     shown = _run("evaluate", tmp_path / "r.h5")
     assert shown.exit_code == 3
-    assert shown.stderr.startswith(f"rfpose: {tmp_path / 'r.h5'}: carries no truth; add --truth")
+    assert shown.stderr.startswith(f"rfpose: {tmp_path / 'r.h5'}: carries no truth; give --truth")
     assert _json("evaluate", tmp_path / "r.h5", "--truth", directory / "rec.h5")["solved"] == 3
 
 

@@ -23,7 +23,7 @@ from rfpose.pipeline.layout.site import Postures
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result_summary import summarise as summarise_result
 from rfpose.pipeline.simulate import simulate
-from rfpose.scenario import check_scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 SITE = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 
@@ -55,12 +55,8 @@ def test_map_writes_json_csv_and_picture(tmp_path):
 
 def short_site(tmp_path, **changes):
     """Table 2's field in short frames; ``changes`` by table."""
-    data = load_scenario(SITE).model_dump(exclude_none=True)
-    data["radio"]["frame_samples"] = 8000
-    for table, keys in changes.items():
-        data[table] = {**data.get(table, {}), **keys} if isinstance(keys, dict) else keys
     site = tmp_path / "site.toml"
-    site.write_text(check_scenario(data).to_toml())
+    load_scenario(SITE).changed(radio={"frame_samples": 8000}).changed(**changes).save(site, force=True)
     return site
 
 

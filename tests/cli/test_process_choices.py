@@ -13,7 +13,7 @@ from rfpose.cli._app import app
 from rfpose.cli.process import POSE_NAMES, REFLECTION_NAMES
 from rfpose.pipeline.choice import POSES, REFLECTIONS
 from rfpose.pipeline.demo import shipped_scenario
-from rfpose.scenario import Reflection, Scenario, load_scenario
+from rfpose.scenario import Reflection, load_scenario
 
 
 def _run(*arguments: object) -> Result:
@@ -31,11 +31,12 @@ def _json(*arguments: object) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     where = tmp_path_factory.mktemp("choices")
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    data["heliostat"] = [{**h, "pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 0.0} for h in data["heliostat"][:2]]
-    data["radio"]["frame_samples"] = 8000
-    data["simulation"] |= {"frame_count": 2, "sun_azimuth_deg": 170.0}
-    (where / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    shipped = load_scenario(shipped_scenario("table2_100m.toml"))
+    two = shipped.changed(heliostat=shipped.heliostat[:2], radio={"frame_samples": 8000})
+    two.changed(
+        heliostat={"pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 0.0},
+        simulation={"frame_count": 2, "sun_azimuth_deg": 170.0},
+    ).save(where / "site.toml")
     _json("simulate", where / "site.toml", "-o", where / "rec.h5")
     return where / "rec.h5"
 
@@ -109,7 +110,7 @@ def test_how_integers_were_found_is_in_the_result(recording: Path, tmp_path: Pat
 def test_independent_receivers_have_no_such_choice(recording: Path, tmp_path: Path) -> None:
     refused = _run("process", recording, "-o", tmp_path / "r.h5", "--pose", "independent", "--reflection", "estimate")
     assert refused.exit_code in (2, 3)
-    assert "`reflection` is of pose `rigid`" in refused.stderr
+    assert "`--reflection` is of pose `rigid`" in refused.stderr
     plain = _json("process", recording, "-o", tmp_path / "p.h5", "--pose", "independent")
     assert plain["choice"] == {
         "reflection": "none",

@@ -42,11 +42,10 @@ finally:
 
 
 def _scenario(**simulation: object) -> Scenario:
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:2]
-    data["radio"]["frame_samples"] = 8000
-    data["simulation"] |= {"frame_count": 4, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0, **simulation}
-    return Scenario.model_validate(data)
+    shipped, still = load_scenario(SHIPPED), {"frame_count": 4, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0}
+    return shipped.changed(
+        heliostat=shipped.heliostat[:2], radio={"frame_samples": 8000}, simulation=still | simulation
+    )
 
 
 def _simulate(directory: Path, *, seed: int = 1, name: str = "rec.h5") -> Path:

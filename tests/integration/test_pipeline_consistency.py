@@ -15,7 +15,7 @@ from rfpose.pipeline.evaluate import Evaluation, evaluate, read_truth
 from rfpose.pipeline.process import process
 from rfpose.pipeline.result import Result
 from rfpose.pipeline.simulate import simulate
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 N_FRAME = 120
@@ -23,17 +23,12 @@ N_HELIOSTAT = 3
 
 
 def _site(path: Path) -> Path:
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = [data["heliostat"][k] for k in (0, 4, 8)]
-    data["radio"]["frame_samples"] = 4000
-    data["radio"]["clock_search_ppm"] = 5.0
-    data["simulation"] |= {
-        "frame_count": N_FRAME,
-        "frame_interval_s": 0.5,
-        "tone_snr_db": 55.0,
-        "sun_azimuth_deg": 170.0,
-    }
-    path.write_text(Scenario.model_validate(data).to_toml())
+    shipped = load_scenario(SHIPPED)
+    shipped.changed(
+        heliostat=shipped.heliostat[::4],
+        radio={"frame_samples": 4000, "clock_search_ppm": 5.0},
+        simulation={"frame_count": N_FRAME, "frame_interval_s": 0.5, "tone_snr_db": 55.0, "sun_azimuth_deg": 170.0},
+    ).save(path)
     return path
 
 

@@ -18,14 +18,9 @@ N_POSTURE = 16
 
 def short_frames(**simulation):
     """The shipped scenario with frames of 2400 samples, the SNR raised so that the carrier is found as before."""
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    data["radio"]["frame_samples"] = 2400
-    data["simulation"] |= {"tone_snr_db": 55.0, **simulation}
-    if "ground" in simulation and simulation["ground"] is None:
-        del data["simulation"]["ground"]
-        data["reflection"] = {"model": "none"}
-    return type(base).model_validate(data)
+    dry = "ground" in simulation and simulation["ground"] is None
+    site = load_scenario(DATA).changed(radio={"frame_samples": 2400}, **({"reflection": None} if dry else {}))
+    return site.changed(simulation={"tone_snr_db": 55.0, **simulation}, reflection={"model": "none"} if dry else {})
 
 
 def courses(scenario, heliostat):

@@ -18,7 +18,7 @@ from rfpose.pipeline.result import Result
 from rfpose.pipeline.result_file import write_result
 from rfpose.pipeline.solve import solve
 from rfpose.pipeline.truth_rows import align_truth, truth_rows
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from rfpose.truth import Truth
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -28,9 +28,8 @@ SNR = 1e4
 
 def _exact_result() -> Result:
     """Return a result without noise: two heliostats that look up, three frames, truth with it."""
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:2]
-    scenario = Scenario.model_validate(data)
+    shipped = load_scenario(SHIPPED)
+    scenario = shipped.changed(heliostat=shipped.heliostat[:2])
     mirror = np.array(scenario.heliostat[0].receiver_mirror_m)
     place = np.concatenate([*(mirror + pivot for pivot in scenario.pivot_enu_m), scenario.calibration_enu_m])
     distance = np.linalg.norm(place[:, None] - scenario.transmitter_enu_m, axis=-1)

@@ -329,7 +329,7 @@ def test_commands_say_options_where_the_library_says_arguments() -> None:
     said = {
         "a.h5: exists already, `force=True` replaces it": "a.h5: exists already, --force replaces it",
         "leave it off (`filtered=False`)": "leave it off (--no-filter)",
-        "`tone_snr_db` must be a number": "--snr must be a number",
+        "`tone_snr_db` must be a number": "`--snr` must be a number",
         "take fewer, `n_tone=3`": "take fewer, --tones 3",
         "set `simulation.tone_snr_db` and `force`": "set `simulation.tone_snr_db` and `force`",
         "give `scenario=FILE`": "give `scenario=FILE`",

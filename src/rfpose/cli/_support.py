@@ -75,15 +75,15 @@ def in_options(text: str, options: Mapping[str, click.Parameter]) -> str:
     """
 
     def option(found: re.Match[str]) -> str:
-        parameter, value = options.get(found[1]), found[2].strip("'")
+        parameter, value = options.get(found[1]), (found[2] or "").strip("='")
         if not isinstance(parameter, click.Option):
             return found[0]
         if value == "False" and parameter.secondary_opts:
             return parameter.secondary_opts[0]
         flag = max(parameter.opts, key=len)
-        return flag if value in ("", "True") else f"{flag} {value}"
+        return f"`{flag}`" if found[2] is None else flag if value in ("", "True") else f"{flag} {value}"
 
-    return re.sub(r"`(\w+)=([^`]*)`", option, re.sub(r"^`(\w+)`()", option, text))
+    return re.sub(r"`(\w+)(=[^`]*)`", option, re.sub(r"^`(\w+)(=)?`", option, text))
 
 
 def force_option(function: F) -> F:

@@ -223,8 +223,8 @@ class Scenario(Record):
         ----------
         **tables
             By the names of the file. Of a table, the keys that are given are changed, down through tables in it, and
-            the others stay; None takes a key away, so that its default holds. Anything else, lists of tables too,
-            takes the place of what was there. Records may stand for tables.
+            the others stay; None takes a key away, so that its default holds. A table given for a list of tables
+            changes each of them. Anything else takes the place of what was there; records may stand for tables.
 
         Raises
         ------
@@ -238,6 +238,8 @@ class Scenario(Record):
         >>> short = site.changed(heliostat=site.heliostat[:3], simulation={"frame_count": 2, "tone_snr_db": 30.0})
         >>> short.heliostat_ids, short.simulation.frame_count
         (('H01', 'H02', 'H03'), 2)
+        >>> [mirror.pivot_sigma_m for mirror in short.changed(heliostat={"pivot_sigma_m": 0.005}).heliostat]
+        [0.005, 0.005, 0.005]
         """
         return check_scenario(_merged(self.model_dump(exclude_none=True), tables))
 
@@ -405,8 +407,8 @@ def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
         if value is None:
             out.pop(key, None)
         elif isinstance(value, Mapping):
-            inner = out.get(key)
-            out[key] = _merged(inner if isinstance(inner, Mapping) else {}, value)
+            inner = out.get(key, {})
+            out[key] = [_merged(each, value) for each in inner] if isinstance(inner, tuple) else _merged(inner, value)
         else:
             out[key] = _plain(value)
     return out

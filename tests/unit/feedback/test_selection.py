@@ -142,7 +142,7 @@ def test_with_redundancy_the_noise_is_the_measured_one(sound: Path) -> None:
 def test_too_many_parameters_for_the_records_are_told(sound: Path, tmp_path: Path) -> None:
     write_paint(tmp_path, {"AA11": EAST}, n_record=8, sigma_rad=1e-3)
     (item,) = calibrate(tmp_path, parameters="level-location")
-    assert any("do not carry" in note and "--parameters auto" in note for note in item.notes), item.notes
+    assert any("do not carry" in note and "`parameters=auto`" in note for note in item.notes), item.notes
     assert len(PARAMETER_SETS["level-location"]) == 12
 
 
@@ -327,7 +327,7 @@ def test_other_separators_and_decimals_are_told(tmp_path: Path) -> None:
         (["--dish", "--hours", -1], "--hours"),
         (["--dish", "--hours", 1e9], "--hours"),
         (["--dish", "--step", 0], "--step"),
-        (["--dish", "--step", 1e-9], "longer step"),
+        (["--dish", "--step", 1e-9], "longer --step"),
         (["--dish", "--next", 10**6], "postures"),
         (["--dish", "--site", 95, 0, 0], "latitude"),
         (["--dish", "--site", -23, -69, -500000], "altitude"),

@@ -17,7 +17,7 @@ from rfpose.layout.budget import make_plan, noise_bound
 from rfpose.layout.maps import ESTIMATORS, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
-from rfpose.measurement import SCENARIO
+from rfpose.measurement import SCENARIO, first_snr
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, counted, number
@@ -231,6 +231,7 @@ def layout_map(
     <LayoutMap 'Table 2, 100 m field': 12 heliostats, 1 posture>
     """
     site = load_site(scenario, field)
+    first_snr(site, tone_snr_db)  # what the caller says is no fault of the file
     with naming(scenario):
         return _map(site, estimators, postures or Postures(suns_deg=suns_deg), tone_snr_db, sight, sensitivity)
 
