@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from rfpose.pipeline.calibrate import calibrate
     from rfpose.pipeline.demo import shipped_scenario
     from rfpose.pipeline.evaluate import evaluate
+    from rfpose.pipeline.formats.result_file import open_result
+    from rfpose.pipeline.formats.track_file import open_track
     from rfpose.pipeline.layout import budget, layout_map, optimise
     from rfpose.pipeline.process import process
-    from rfpose.pipeline.result_file import open_result
     from rfpose.pipeline.simulate import simulate
     from rfpose.pipeline.track import track
-    from rfpose.pipeline.track_file import open_track
     from rfpose.recording import open_recording
     from rfpose.scenario import load_scenario
 

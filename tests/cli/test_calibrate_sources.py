@@ -24,8 +24,8 @@ from rfpose.feedback.optics import reflect, target_offset_m
 from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.pipeline.demo import shipped_scenario
-from rfpose.pipeline.mount_file import read_models
-from rfpose.pipeline.result_file import open_result
+from rfpose.pipeline.formats.mount_file import read_models
+from rfpose.pipeline.formats.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"

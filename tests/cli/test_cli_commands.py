@@ -17,7 +17,7 @@ from rfpose.cli.demo import write_report
 from rfpose.drawing import save_figure
 from rfpose.pipeline.demo import run_demo, shipped_scenario
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.result_file import open_result
+from rfpose.pipeline.formats.result_file import open_result
 from rfpose.recording import open_recording
 from rfpose.recording.base import RecordingFormat
 from rfpose.scenario import Scenario, load_scenario

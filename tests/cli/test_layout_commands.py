@@ -18,10 +18,10 @@ from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
 from rfpose.measurement import noise_of
 from rfpose.pipeline.evaluate import evaluate
+from rfpose.pipeline.formats.result_summary import summarise as summarise_result
 from rfpose.pipeline.layout import Rules, budget, layout_map, optimise
 from rfpose.pipeline.layout.site import Postures
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_summary import summarise as summarise_result
 from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import load_scenario
 

@@ -12,8 +12,8 @@ from rfpose.cli import _app
 from rfpose.cli.track import _METHODS
 from rfpose.errors import RecordingError
 from rfpose.feedback.tracking import METHODS
+from rfpose.pipeline.formats.track_file import is_track, open_track
 from rfpose.pipeline.track import TrackChanges, track
-from rfpose.pipeline.track_file import is_track, open_track
 from rfpose.scenario import load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "tracking_100m.toml"

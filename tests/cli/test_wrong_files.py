@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from rfpose.cli._app import app
 from rfpose.errors import install_remedy
 from rfpose.kinds import kind_of
-from rfpose.pipeline.mount_file import MODEL_FORMAT
+from rfpose.pipeline.formats.mount_file import MODEL_FORMAT
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track

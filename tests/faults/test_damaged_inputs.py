@@ -23,18 +23,18 @@ from rfpose.pipeline.aim import plan_commands
 from rfpose.pipeline.calibrate import calibrate
 from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_radio
 from rfpose.pipeline.evaluate import evaluate, read_truth
-from rfpose.pipeline.field_view import field_of_result, field_of_scenario, history
+from rfpose.pipeline.formats.mount_file import read_models
+from rfpose.pipeline.formats.result_file import open_result
+from rfpose.pipeline.formats.result_summary import write_poses_csv
+from rfpose.pipeline.formats.track_file import open_track
 from rfpose.pipeline.inspect import inspect_file
-from rfpose.pipeline.mount_file import read_models
+from rfpose.pipeline.pictures.track_view import picture_of_track
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import open_result
-from rfpose.pipeline.result_summary import write_poses_csv
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
-from rfpose.pipeline.track_file import open_track
-from rfpose.pipeline.track_view import picture_of_track
 from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
 from rfpose.tables import write_csv
+from rfpose.viewer.models.field_view import field_of_result, field_of_scenario, history
 
 # what is wrong may well give NaN, of which numpy warns
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -13,9 +13,9 @@ import pytest
 from rfpose.dsp import CalibrationStatus, LineStatus
 from rfpose.errors import GeometryError, InvalidInputError, RecordingError, ScenarioError
 from rfpose.multilat import FixStatus, PoseStatus
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_summary import summarise
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_summary import summarise
 from rfpose.recording import RecordingWriter
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.simulator import Chunk, Simulator

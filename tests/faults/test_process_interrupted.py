@@ -12,8 +12,8 @@ import pytest
 
 from rfpose.errors import RecordingError
 from rfpose.pipeline import measure
+from rfpose.pipeline.formats.result_file import open_result
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import open_result
 from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 

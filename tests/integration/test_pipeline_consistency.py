@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from rfpose.pipeline.evaluate import Evaluation, evaluate, read_truth
+from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result import Result
 from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import load_scenario
 

@@ -16,11 +16,11 @@ from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice, choose
 from rfpose.pipeline.evaluate import evaluate
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import open_result, write_result
+from rfpose.pipeline.formats.result_summary import summarise
 from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import open_result, write_result
-from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import check_solvable, solve
 from rfpose.scenario import Scenario, load_scenario

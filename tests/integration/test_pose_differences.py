@@ -14,8 +14,8 @@ from rfpose.multilat import FixStatus, RangeStatus
 from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Evaluation, evaluate
+from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result import Result
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import check_solvable
 from rfpose.scenario import Scenario, load_scenario

@@ -12,11 +12,11 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.multilat import TrackStatus
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import evaluate
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import open_result
+from rfpose.pipeline.formats.result_summary import summarise
 from rfpose.pipeline.inspect import inspect_file
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import open_result
-from rfpose.pipeline.result_summary import summarise
 from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import Scenario, load_scenario
 

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 
 from rfpose.cli._app import app
 from rfpose.pipeline.evaluate import evaluate, read_truth
+from rfpose.pipeline.formats.result_file import open_result
 from rfpose.pipeline.process import process
-from rfpose.pipeline.result_file import open_result
 
 pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
 

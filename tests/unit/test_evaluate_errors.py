@@ -14,10 +14,10 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.multilat import PoseStatus, joint_covariance, mirror_normal
 from rfpose.pipeline.evaluate import Statistics, evaluate, read_truth
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import write_result
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import write_result
+from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
 from rfpose.pipeline.solve import solve
-from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.scenario import load_scenario
 from rfpose.truth import Truth
 

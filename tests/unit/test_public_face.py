@@ -19,9 +19,9 @@ import pytest
 import rfpose as rf
 from rfpose.cli._support import in_options
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
-from rfpose.pipeline.result import Result
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.track_file import Track
 from rfpose.pipeline.simulate import SimulatedRecording
-from rfpose.pipeline.track_file import Track
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 

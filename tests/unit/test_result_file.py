@@ -17,10 +17,10 @@ import pytest
 
 from rfpose.dsp import TonePhases
 from rfpose.errors import RecordingError
-from rfpose.pipeline import result_file
-from rfpose.pipeline.result import Result, frame_time
-from rfpose.pipeline.result_file import KEYS, is_result, open_result, write_result
-from rfpose.pipeline.result_summary import CSV_COLUMNS, summarise, write_poses_csv
+from rfpose.pipeline.formats import result_file
+from rfpose.pipeline.formats.result import Result, frame_time
+from rfpose.pipeline.formats.result_file import KEYS, is_result, open_result, write_result
+from rfpose.pipeline.formats.result_summary import CSV_COLUMNS, summarise, write_poses_csv
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import load_scenario
 from rfpose.truth import Truth

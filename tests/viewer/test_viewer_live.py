@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfpose.pipeline.live_track import LiveTrack
 from rfpose.scenario import Scenario, load_scenario
+from rfpose.viewer.models.live_track import LiveTrack
 from rfpose.viewer.state.live import LiveRun
 from rfpose.viewer.views.live import LiveView
 from rfpose.viewer.window import MainWindow

@@ -13,9 +13,9 @@ import pytest
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError, ScenarioError
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.demo import shipped_scenario
-from rfpose.pipeline.field_view import history, project
-from rfpose.pipeline.result_file import open_result
+from rfpose.pipeline.formats.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario, parse_scenario
+from rfpose.viewer.models.field_view import history, project
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
 from rfpose.viewer.state.observed import Event

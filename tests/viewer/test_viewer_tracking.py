@@ -16,9 +16,17 @@ from rfpose.cli import _app
 from rfpose.drawing import save_figure
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.pipeline.demo import shipped_scenario
+from rfpose.pipeline.formats.track_file import Track, open_track
+from rfpose.pipeline.pictures.track_view import (
+    MODES,
+    clock,
+    groups,
+    instant_at,
+    local_hour,
+    picture_of_track,
+    what_happened,
+)
 from rfpose.pipeline.track import TrackChanges, track
-from rfpose.pipeline.track_file import Track, open_track
-from rfpose.pipeline.track_view import MODES, clock, groups, instant_at, local_hour, picture_of_track, what_happened
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.viewer.views.tracking import TrackingView
 from rfpose.viewer.window import MainWindow

@@ -118,7 +118,7 @@ def command(
             force=force,
             on_progress=on_progress,
         )
-        from rfpose.pipeline.result_summary import write_poses_csv
+        from rfpose.pipeline.formats.result_summary import write_poses_csv
 
         if csv_path is not None:
             write_poses_csv(result, csv_path)

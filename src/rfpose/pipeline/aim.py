@@ -19,7 +19,7 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus
 from rfpose.feedback.sun import Site, unix_seconds
 from rfpose.files import claim
-from rfpose.pipeline.mount_file import StoredMount, read_models
+from rfpose.pipeline.formats.mount_file import StoredMount, read_models
 
 __all__ = ["Plan", "plan_commands", "write_commands"]
 

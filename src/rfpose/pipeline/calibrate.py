@@ -20,14 +20,14 @@ from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
 from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
 from rfpose.pipeline.calibration_sources import Gathered, read_camera, read_drone, read_paint, read_radio
-from rfpose.pipeline.mount_file import MountFile, read_models, write_model_file
+from rfpose.pipeline.formats.mount_file import MountFile, read_models, write_model_file
 from rfpose.shown import Shown, counted, number
 from rfpose.tables import Tabled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rfpose.pipeline.result import Result
+    from rfpose.pipeline.formats.result import Result
 
 __all__ = ["Calibrations", "HeliostatReport", "calibrate"]
 

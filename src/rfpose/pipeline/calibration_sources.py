@@ -29,10 +29,10 @@ from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.foreign import load_toml, read_text
-from rfpose.pipeline.mount_file import MountFile, StoredMount
+from rfpose.pipeline.formats.mount_file import MountFile, StoredMount
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.result import Result
+    from rfpose.pipeline.formats.result import Result
 
 __all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
 
@@ -79,8 +79,8 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
     """
     # a result's reader takes longer to load than a PAINT directory to read
     from rfpose.multilat import PoseStatus
-    from rfpose.pipeline.result import frame_time
-    from rfpose.pipeline.result_file import open_result
+    from rfpose.pipeline.formats.result import frame_time
+    from rfpose.pipeline.formats.result_file import open_result
 
     log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
     for row in _rows(motors, ("time_utc", "heliostat", "axis_1", "axis_2")):

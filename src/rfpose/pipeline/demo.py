@@ -124,8 +124,8 @@ def _run(
     """Make all but the report; return the evaluations of all phases at once and of each receiver alone."""
     from rfpose.drawing import save_figure
     from rfpose.pipeline.evaluate import evaluate
+    from rfpose.pipeline.formats.result_summary import write_poses_csv
     from rfpose.pipeline.process import process
-    from rfpose.pipeline.result_summary import write_poses_csv
     from rfpose.pipeline.simulate import simulate
     from rfpose.pipeline.solve import solve
     from rfpose.recording import open_recording

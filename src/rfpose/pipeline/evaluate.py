@@ -18,11 +18,11 @@ from rfpose.multilat import FixStatus, PoseStatus, TrackStatus, position_bound
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import is_result, open_result
+from rfpose.pipeline.formats.result_summary import EXPLAINED, count_reasons
+from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
 from rfpose.pipeline.noise import phase_noise
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import is_result, open_result
-from rfpose.pipeline.result_summary import EXPLAINED, count_reasons
-from rfpose.pipeline.truth_rows import align_truth, truth_rows
 from rfpose.recording import open_recording
 from rfpose.scenario import Scenario
 from rfpose.shown import Shown, number

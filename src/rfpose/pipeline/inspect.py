@@ -81,9 +81,9 @@ def _scenario(scenario: Scenario) -> dict[str, Any]:
 
 
 def _result(path: Path) -> dict[str, Any]:
-    from rfpose.pipeline.result import frame_time
-    from rfpose.pipeline.result_file import open_result
-    from rfpose.pipeline.result_summary import summarise
+    from rfpose.pipeline.formats.result import frame_time
+    from rfpose.pipeline.formats.result_file import open_result
+    from rfpose.pipeline.formats.result_summary import summarise
 
     result = open_result(path)
     starts = result.frame_start_index
@@ -105,7 +105,7 @@ def _result(path: Path) -> dict[str, Any]:
 
 
 def _track(path: Path) -> dict[str, Any]:
-    from rfpose.pipeline.track_file import open_track
+    from rfpose.pipeline.formats.track_file import open_track
 
     track = open_track(path)
     times = [datetime.fromtimestamp(float(t), UTC).isoformat() for t in track.unix_s[:: max(len(track.unix_s) - 1, 1)]]
@@ -136,7 +136,7 @@ def _track(path: Path) -> dict[str, Any]:
 
 
 def _models(path: Path) -> dict[str, Any]:
-    from rfpose.pipeline.mount_file import read_models
+    from rfpose.pipeline.formats.mount_file import read_models
 
     content = read_models(path)
     site = content.site

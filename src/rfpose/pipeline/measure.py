@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
-from rfpose.pipeline._journal import Entry, Journal
 from rfpose.pipeline._workers import worker_pool
+from rfpose.pipeline.formats.journal import Entry, Journal
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.measurement import phase_sigma_rad
-from rfpose.pipeline.result import Result
+from rfpose.pipeline.formats.result import Result
 from rfpose.truth import Truth
 
 __all__ = ["PhaseNoise", "phase_noise"]

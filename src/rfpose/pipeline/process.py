@@ -14,14 +14,14 @@ import numpy.typing as npt
 from rfpose import __version__
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
-from rfpose.pipeline._journal import Journal
+from rfpose.pipeline.formats.journal import Journal
 from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
 from rfpose.recording.members import members
 from rfpose.scenario import Scenario, scenario_of
 
 if TYPE_CHECKING:
     from rfpose.pipeline.choice import PoseChoice
-    from rfpose.pipeline.result import Result
+    from rfpose.pipeline.formats.result import Result
 
 __all__ = ["process"]
 
@@ -111,10 +111,10 @@ def process(
             # compiled code, which none of the refusals above should wait for
             from rfpose.dsp import ESTIMATORS
             from rfpose.pipeline.choice import choose
+            from rfpose.pipeline.formats.result_file import write_result
+            from rfpose.pipeline.formats.truth_rows import align_truth
             from rfpose.pipeline.measure import journal_key, measure_tones
-            from rfpose.pipeline.result_file import write_result
             from rfpose.pipeline.solve import check_solvable, solve
-            from rfpose.pipeline.truth_rows import align_truth
 
             if estimator not in ESTIMATORS:
                 raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")

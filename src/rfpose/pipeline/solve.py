@@ -24,8 +24,8 @@ from rfpose.multilat import (
 )
 from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, choose
+from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.mirrors import is_calibrated
-from rfpose.pipeline.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.rigid import solve_rigid_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 from rfpose import __version__
 from rfpose.errors import ScenarioError
 from rfpose.files import claim
-from rfpose.pipeline._checkpoint import Checkpoint
+from rfpose.pipeline.formats.checkpoint import Checkpoint
 from rfpose.scenario import Scenario, naming, scenario_of
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.track_file import Track
+    from rfpose.pipeline.formats.track_file import Track
 
 __all__ = ["TrackChanges", "track"]
 
@@ -111,7 +111,7 @@ def track(
             pass
         # compiled code, which none of the refusals above should wait for
         from rfpose.feedback.tracking import Simulation
-        from rfpose.pipeline.track_file import track_of, write_track
+        from rfpose.pipeline.formats.track_file import track_of, write_track
         from rfpose.pipeline.track_iq import check_with_iq
 
         with naming(scenario):

@@ -13,10 +13,10 @@ from rfpose import __version__
 from rfpose.drawing import png_of
 from rfpose.errors import RfposeError
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_summary import summarise
-from rfpose.pipeline.track_file import Track
-from rfpose.pipeline.track_view import MODES, ON_RECEIVER, TrackPicture, clock
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_summary import summarise
+from rfpose.pipeline.formats.track_file import Track
+from rfpose.pipeline.pictures.track_view import MODES, ON_RECEIVER, TrackPicture, clock
 from rfpose.recording import describe
 from rfpose.viewer.export import picture_tag
 from rfpose.viewer.views.field import COLOURS, FieldView

@@ -21,7 +21,7 @@ from rfpose.feedback.mount import PARAMETERS, Mount
 from rfpose.feedback.paint import PaintHeliostat, read_heliostat
 from rfpose.feedback.selection import PLANNED_SIGMA, candidates, fit_chosen
 from rfpose.pipeline.calibrate import calibrate
-from rfpose.pipeline.mount_file import read_models
+from rfpose.pipeline.formats.mount_file import read_models
 
 EAST, WEST = (20.0, 80.0, 1.5), (-30.0, 60.0, 1.5)
 CREEP_RAD_PER_DAY = 0.05e-3 / 30.4

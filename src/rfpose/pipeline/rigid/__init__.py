@@ -10,8 +10,8 @@ from rfpose.dsp import Calibration, TonePhases
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.estimation import protected, without_vague
 from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.result import FixTable, PoseTable
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.result import FixTable, PoseTable
 from rfpose.pipeline.rigid.inputs import Stages, solve_group
 from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
 from rfpose.scenario import Scenario

@@ -17,8 +17,8 @@ from rfpose.multilat.rigid import MirrorProblem
 from rfpose.multilat.rigid.integers import align_points
 from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.result import FixTable
 from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, observations
-from rfpose.pipeline.result import FixTable
 from rfpose.scenario import Scenario
 
 _VAGUE_RATIO = 100.0

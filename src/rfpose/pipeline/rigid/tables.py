@@ -16,11 +16,11 @@ from rfpose.multilat.integrity import IntegrityStatus
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import IntegerMethod
+from rfpose.pipeline.formats.result import DelayTable, FilteredTable, IntegrityTable, PoseTable, ReflectionTable
 from rfpose.pipeline.mirrors import (
     MirrorGroup,
     mirror_groups,
 )
-from rfpose.pipeline.result import DelayTable, FilteredTable, IntegrityTable, PoseTable, ReflectionTable
 from rfpose.pipeline.rigid.inputs import Stages
 
 BoolArray = npt.NDArray[np.bool_]

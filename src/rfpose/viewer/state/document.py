@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.errors import RfposeError
-from rfpose.pipeline.field_view import FieldPicture, field_of_result, field_of_scenario
-from rfpose.pipeline.result import Result
-from rfpose.pipeline.result_file import is_result, open_result
-from rfpose.pipeline.spectra import SharedRecording, viewing_frames
-from rfpose.pipeline.track_file import is_track, open_track
-from rfpose.pipeline.track_view import TrackPicture, picture_of_track
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import is_result, open_result
+from rfpose.pipeline.formats.track_file import is_track, open_track
+from rfpose.pipeline.pictures.track_view import TrackPicture, picture_of_track
 from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario, load_scenario
+from rfpose.viewer.models.field_view import FieldPicture, field_of_result, field_of_scenario
+from rfpose.viewer.models.spectra import SharedRecording, viewing_frames
 
 __all__ = ["Document", "Kind", "open_document"]
 

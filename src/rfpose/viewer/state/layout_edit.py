@@ -9,8 +9,8 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.pipeline.live_layout import first_choice, free_carrier_hz, scenario_of_layout
 from rfpose.scenario import Scenario, Transmitter
+from rfpose.viewer.models.live_layout import first_choice, free_carrier_hz, scenario_of_layout
 from rfpose.viewer.state.observed import Event
 
 __all__ = ["LayoutEdit"]
@@ -168,7 +168,7 @@ class LayoutEdit:
             self.moved.emit()
 
     def choose(self, **changes: Any) -> None:
-        """Change estimator, tones, posture, sun or costs; see `rfpose.pipeline.live_layout.LayoutChoice`."""
+        """Change estimator, tones, posture, sun or costs; see `rfpose.viewer.models.live_layout.LayoutChoice`."""
         choice = replace(self.choice, **changes)
         if choice != self.choice:
             self.choice = choice

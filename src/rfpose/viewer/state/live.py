@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from rfpose.pipeline.live_track import LivePicture, LiveTrack
+from rfpose.viewer.models.live_track import LivePicture, LiveTrack
 from rfpose.viewer.state.observed import Event
 
 __all__ = ["FACTORS", "LiveRun"]

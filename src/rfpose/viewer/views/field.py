@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
 
 from rfpose.checks import FloatArray
 from rfpose.multilat import PoseStatus
-from rfpose.pipeline.field_view import FieldPicture, History, history
+from rfpose.viewer.models.field_view import FieldPicture, History, history
 from rfpose.viewer.state.session import Selection, Session
 from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme
 from rfpose.viewer.views.parts import Plan, Scale, Table, View, plot_in, segments

@@ -35,7 +35,7 @@ from PySide6.QtWidgets import (
 
 from rfpose.errors import RfposeError
 from rfpose.files import write_atomically
-from rfpose.pipeline.live_layout import (
+from rfpose.viewer.models.live_layout import (
     ESTIMATOR_NAMES,
     OPTIMISED,
     LiveLayout,

@@ -11,7 +11,7 @@ from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QShowEvent
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QPushButton, QSplitter, QVBoxLayout
 
-from rfpose.pipeline.live_track import LivePicture, LiveTrack
+from rfpose.viewer.models.live_track import LivePicture, LiveTrack
 from rfpose.viewer.state.live import FACTORS, LiveRun
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme

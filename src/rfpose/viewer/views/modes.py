@@ -9,7 +9,7 @@ import numpy as np
 import pyqtgraph as pg
 
 from rfpose.checks import FloatArray
-from rfpose.pipeline.track_view import MODES, ON_RECEIVER, Instant, mode_text
+from rfpose.pipeline.pictures.track_view import MODES, ON_RECEIVER, Instant, mode_text
 from rfpose.viewer.theme import Theme
 
 __all__ = ["ModeLegend", "away_marks"]

@@ -21,7 +21,7 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.checks import FloatArray
-from rfpose.pipeline.field_view import FieldPicture
+from rfpose.viewer.models.field_view import FieldPicture
 from rfpose.viewer.state.observed import Event
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme, colour_table, see_through

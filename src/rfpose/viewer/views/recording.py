@@ -20,7 +20,8 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.errors import RfposeError
-from rfpose.pipeline.spectra import (
+from rfpose.recording import describe
+from rfpose.viewer.models.spectra import (
     FrameLook,
     PhaseTrack,
     Spectrum,
@@ -33,7 +34,6 @@ from rfpose.pipeline.spectra import (
     spectrum,
     waterfall,
 )
-from rfpose.recording import describe
 from rfpose.viewer.state.document import Document
 from rfpose.viewer.state.session import Selection, Session
 from rfpose.viewer.theme import SERIES, Theme

@@ -11,7 +11,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
 
 from rfpose.checks import FloatArray
-from rfpose.pipeline.field_view import FieldPicture, project
+from rfpose.viewer.models.field_view import FieldPicture, project
 from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.parts import Dots, segments
 

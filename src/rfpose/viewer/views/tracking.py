@@ -22,7 +22,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from rfpose.pipeline.track_view import Happening, Instant, TrackPicture, clock, groups
+from rfpose.pipeline.pictures.track_view import Happening, Instant, TrackPicture, clock, groups
 from rfpose.viewer.state.playback import SPEEDS
 from rfpose.viewer.state.session import Selection, Session
 from rfpose.viewer.theme import SERIES, Theme

@@ -26,7 +26,7 @@ from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
 from rfpose.kinds import check_kind, kind_of
-from rfpose.pipeline.columns import (
+from rfpose.pipeline.formats.columns import (
     ENU,
     Column,
     ColumnWriter,
@@ -36,8 +36,8 @@ from rfpose.pipeline.columns import (
     text_label,
     write_names,
 )
-from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
-from rfpose.pipeline.result import LAST_TIME_S
+from rfpose.pipeline.formats.hdf5_values import DAMAGES, array_of, text_of
+from rfpose.pipeline.formats.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import Scenario, parse_scenario
@@ -233,7 +233,7 @@ class Track(Shown, Tabled):
 
     def plot(self) -> Figure:
         """Draw error, flux and modes in the course of the first day, errors spread over mirrors, and by day."""
-        from rfpose.pipeline.track_pictures import draw_track
+        from rfpose.pipeline.pictures.tracking import draw_track
 
         return draw_track(self)
 

@@ -11,7 +11,7 @@ import numpy as np
 from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking.live import LiveField, Moment, live_scenario
-from rfpose.pipeline.track_view import Instant, instant_at
+from rfpose.pipeline.pictures.track_view import Instant, instant_at
 from rfpose.scenario import Scenario
 
 __all__ = ["DISTURBANCES", "LivePicture", "LiveTrack"]

@@ -11,7 +11,7 @@ from rfpose.checks import FloatArray
 from rfpose.drawing import mark_places, new_figure
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.evaluate import Evaluation
-from rfpose.pipeline.result import Result
+from rfpose.pipeline.formats.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ from rfpose.multilat import FixStatus, PoseStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.pipeline.result import (
+from rfpose.pipeline.formats.result import (
     DelayTable,
     FilteredTable,
     IntegrityTable,

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.geometry import unit
-from rfpose.pipeline.track_file import Track
+from rfpose.pipeline.formats.track_file import Track
 from rfpose.scenario.tracking import Event
 
 __all__ = [

@@ -17,7 +17,7 @@ from rfpose.multilat import FixStatus, PoseStatus, RangeStatus
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.pipeline.evaluate import evaluate
-from rfpose.pipeline.result import Result, frame_time
+from rfpose.pipeline.formats.result import Result, frame_time
 from rfpose.scenario import Scenario
 
 __all__ = ["Exclusion", "FieldPicture", "History", "field_of_result", "field_of_scenario", "history", "project"]
@@ -200,7 +200,7 @@ def _time_s(result: Result) -> FloatArray:
 
 def _true_normals(result: Result) -> FloatArray | None:
     """(frame, heliostat, xyz) true normals; None without a truth."""
-    from rfpose.pipeline.truth_rows import truth_rows
+    from rfpose.pipeline.formats.truth_rows import truth_rows
 
     if result.truth is None:
         return None

@@ -278,7 +278,7 @@ class Result(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Return counts of what was solved and what was not, with reasons, as ``rfpose process --json`` prints them."""
-        from rfpose.pipeline.result_summary import summarise
+        from rfpose.pipeline.formats.result_summary import summarise
 
         return summarise(self)
 
@@ -297,7 +297,7 @@ class Result(Shown):
         RecordingError
             The file exists, or cannot be written; what stood under ``path`` is untouched.
         """
-        from rfpose.pipeline.result_file import write_result
+        from rfpose.pipeline.formats.result_file import write_result
 
         write_result(self, path, force=force)
 
@@ -309,7 +309,7 @@ class Result(Shown):
         InvalidInputError
             pandas is not installed; ``what`` is something else.
         """
-        from rfpose.pipeline.result_summary import fix_table, pose_table
+        from rfpose.pipeline.formats.result_summary import fix_table, pose_table
 
         tables = {"poses": pose_table, "fixes": fix_table}
         if what not in tables:
@@ -333,7 +333,7 @@ class Result(Shown):
         InvalidInputError
             xarray is not installed; the result has no such group.
         """
-        from rfpose.pipeline.result_file import dataset
+        from rfpose.pipeline.formats.result_file import dataset
 
         return dataset(self, group)
 
@@ -342,7 +342,7 @@ class Result(Shown):
 
         With ``evaluation`` a mirror's colour is its error instead of the sigma that the result reports.
         """
-        from rfpose.pipeline.pictures import draw_field_map
+        from rfpose.pipeline.pictures.results import draw_field_map
 
         return draw_field_map(self, evaluation=evaluation)
 

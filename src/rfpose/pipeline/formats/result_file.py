@@ -25,7 +25,7 @@ from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.columns import (
+from rfpose.pipeline.formats.columns import (
     ENU,
     FIXED,
     Column,
@@ -36,8 +36,8 @@ from rfpose.pipeline.columns import (
     text_label,
     write_names,
 )
-from rfpose.pipeline.hdf5_values import DAMAGES, array_of, text_of
-from rfpose.pipeline.result import (
+from rfpose.pipeline.formats.hdf5_values import DAMAGES, array_of, text_of
+from rfpose.pipeline.formats.result import (
     LAST_TIME_S,
     DelayTable,
     FilteredTable,

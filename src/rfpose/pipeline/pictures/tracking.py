@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rfpose.drawing import blank_figure
-from rfpose.pipeline.track_file import Track
-from rfpose.pipeline.track_view import groups, local_hour, mode_text, what_happened
+from rfpose.pipeline.formats.track_file import Track
+from rfpose.pipeline.pictures.track_view import groups, local_hour, mode_text, what_happened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
