@@ -8,22 +8,22 @@ them on the same sun, wind and hidden errors of the mounts.
 
 # %%
 # The scenario's ``[tracking]`` table says what mounts, drives, wind, radio and cameras are like. So that this page is
-# made in seconds, the day here has three hours, and the field three mirrors.
+# made in seconds, the day here has three hours, and the field three mirrors. At noon the field is sent away for half an
+# hour.
 import rfpose as rf
 
 site = rf.load_scenario(rf.shipped_scenario("tracking_100m.toml"))
+events = [{"hour": 12.0, "what": "emergency"}, {"hour": 12.5, "what": "release"}]
 day = rf.track(
-    site.changed(tracking={"first_hour": 10.5, "last_hour": 13.5}),
+    site.changed(tracking={"first_hour": 10.5, "last_hour": 13.5, "event": events}),
     methods=["open-loop", "camera-model", "radio-both"],
     heliostats=3,
-    events=[{"hour": 12.0, "what": "emergency"}, {"hour": 12.5, "what": "release"}],
     seed=1,
 )
 day
 
 # %%
-# Errors in the course of the day, light on the receiver, what the mirrors are doing, and how the mirrors differ. At
-# noon the field is sent away and called back.
+# Errors in the course of the day, light on the receiver, what the mirrors are doing, and how the mirrors differ.
 figure = day.plot()
 
 # %%

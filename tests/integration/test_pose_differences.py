@@ -124,7 +124,7 @@ def _short_tone(data: dict[str, Any]) -> None:
     [
         ("independent", None, ScenarioError, "no calibration receiver, and pose `independent`.*pivot_sigma_m"),
         ("rigid", _not_surveyed, ScenarioError, "no calibration receiver.*`H02`.*not surveyed.*pivot_sigma_m"),
-        ("rigid", _reflecting, ScenarioError, "no calibration receiver, and reflections.*--reflection ignore"),
+        ("rigid", _reflecting, ScenarioError, "no calibration receiver, and reflections.*leave reflections out"),
         ("rigid", _short_tone, GeometryError, "ambiguous.*quarter.*add a tone"),
     ],
 )

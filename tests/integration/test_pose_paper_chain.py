@@ -12,11 +12,11 @@ N_FRAME = 80
 EXPECTED = {"three fits": (2.65, 2.79), "rigid, three clocks": (2.60, 2.22), "rigid, one clock": (0.49, 0.51)}
 
 
-def test_two_rows_from_iq_are_at_the_bound(tmp_path):
+def test_two_rows_from_iq_are_at_the_bound():
     spec = importlib.util.spec_from_file_location("pose_chain", BENCHMARK)
     chain = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(chain)
-    found = chain.measure((chain.ROWS[0], chain.ROWS[2]), N_FRAME, tmp_path)
+    found = chain.measure((chain.ROWS[0], chain.ROWS[2]), N_FRAME)
     for name, evaluation in found.items():
         assert evaluation.failed == 0
         for row, expected in zip(evaluation.heliostats, EXPECTED[name], strict=True):
