@@ -24,7 +24,6 @@ __all__ = [
     "kernel_fast",
     "kernel_inline",
     "kernel_parallel",
-    "kernel_parallel_fast",
     "kernel_rows",
     "load_numba",
     "one_thread",
@@ -67,11 +66,6 @@ def kernel_rows(function: Function) -> Kernel:
 def kernel_fast(function: Function) -> Kernel:
     """Compile a serial kernel whose sums may be reordered; NaN keeps its meaning."""
     return Kernel(function, fastmath=_REORDER)
-
-
-def kernel_parallel_fast(function: Function) -> Kernel:
-    """Compile a parallel kernel whose sums may be reordered; NaN keeps its meaning."""
-    return Kernel(function, parallel=True, fastmath=_REORDER)
 
 
 prange = range

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -12,18 +13,18 @@ __all__ = ["Shown", "counted", "html_table", "listed", "number", "plain"]
 _MOST_ROWS = 30
 
 
-class Shown:
+class Shown(ABC):
     """What has a headline and a table of figures: a short ``repr``, and a table in notebooks."""
 
     __slots__ = ()
 
+    @abstractmethod
     def headline(self) -> str:
         """Return what it is and how it went, in one line."""
-        raise NotImplementedError
 
+    @abstractmethod
     def figures(self) -> tuple[list[str], list[list[str]]]:
         """Return header and rows of its main figures."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.headline()}>"

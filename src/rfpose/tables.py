@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,14 +18,14 @@ if TYPE_CHECKING:
 __all__ = ["Tabled", "data_frame", "labelled_library", "write_csv"]
 
 
-class Tabled:
+class Tabled(ABC):
     """What is a table of rows: `save` writes it as CSV, `to_pandas` gives it as a DataFrame."""
 
     __slots__ = ()
 
+    @abstractmethod
     def table(self) -> tuple[list[str], list[list[Any]]]:
         """Return header and rows."""
-        raise NotImplementedError
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the table as CSV, numbers to six digits.

@@ -192,6 +192,16 @@ def test_mistyped(path: Path, value: np.ndarray, message: str) -> None:
         open_result(path)
 
 
+def test_a_code_too_large_for_its_type_does_not_become_another(path: Path) -> None:
+    """256 in a byte is 0: solved."""
+    with h5py.File(path, "r+") as file:
+        codes = file["poses/status"][()].astype(np.int64) + 256
+        del file["poses/status"]
+        file["poses/status"] = codes
+    with pytest.raises(RecordingError, match=r"`/poses/status` holds 2[56]\d, which means nothing"):
+        open_result(path)
+
+
 def test_broken_scenario(path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["scenario"]

@@ -83,7 +83,7 @@ class ColumnWriter:
 
     def write(self, group: h5py.Group, name: str, column: Column, values: npt.ArrayLike) -> None:
         """Write one column."""
-        dataset = group.create_dataset(name, data=np.asarray(values, dtype=column.dtype or None))
+        dataset = group.create_dataset(name, data=np.asarray(values, dtype=column.dtype))
         for key, value in column.attributes(dataset.dtype).items():
             dataset.attrs[key] = value
         if column.dims == (name,):

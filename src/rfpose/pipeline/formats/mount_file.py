@@ -24,9 +24,9 @@ from rfpose.feedback.mount import Actuator, Mount
 from rfpose.feedback.sun import Site, site_from_degrees
 from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
-from rfpose.kinds import kind_of, told_kind
+from rfpose.kinds import told_kind
 
-__all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "is_model", "read_models", "write_model_file"]
+__all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "read_models", "write_model_file"]
 
 MODEL_FORMAT = "rfpose-mount"
 MODEL_VERSION = 1
@@ -90,11 +90,6 @@ class MountFile:
     heliostats: Mapping[str, StoredMount]
     site: Site | None = None
     made_by: Mapping[str, Any] = field(default_factory=dict)
-
-
-def is_model(path: str | Path) -> bool:
-    """Tell whether a file says that it holds mounts; false for whatever cannot be read."""
-    return kind_of(path) == "model"
 
 
 def write_model_file(

@@ -15,11 +15,10 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import read_only
 from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
-from rfpose.errors import InvalidInputError, RecordingError, RfposeError, ScenarioError
+from rfpose.errors import InvalidInputError, RfposeError
 from rfpose.files import write_atomically
-from rfpose.kinds import check_kind, kind_of
+from rfpose.kinds import kind_of
 from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
@@ -36,7 +35,7 @@ from rfpose.pipeline.formats.columns import (
     text_label,
     write_names,
 )
-from rfpose.pipeline.formats.hdf5_values import DAMAGES, array_of, text_of
+from rfpose.pipeline.formats.hdf5_values import FileReader, opened
 from rfpose.pipeline.formats.result import (
     LAST_TIME_S,
     DelayTable,
@@ -49,7 +48,7 @@ from rfpose.pipeline.formats.result import (
     rate_of,
 )
 from rfpose.recording.hdf5 import find_item
-from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
+from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario
 from rfpose.truth import Truth
 
 if TYPE_CHECKING:
@@ -289,32 +288,19 @@ def open_result(path: str | Path) -> Result:
     >>> rf.open_result("result.h5").to_pandas()  # doctest: +SKIP
     """
     path = Path(path)
-    check_kind(path, wanted="result")
-    try:
-        with h5py.File(path, "r") as file:
-            return _Reader(path, file).result()
-    except RecordingError:
-        raise
-    except DAMAGES as error:
-        raise RecordingError(
-            f"{path}: cannot be read as HDF5 ({error}); it is truncated or another kind of file: process again"
-        ) from error
+    with opened(path, wanted="result", version=VERSION, again=_AGAIN) as file:
+        return _Reader(path, file, length=FIXED, again=_AGAIN).result()
 
 
-class _Reader:
-    """Reads one open file; each complaint names the file and the place in it."""
+_AGAIN = "run `rfpose process` again"
 
-    def __init__(self, path: Path, file: h5py.File) -> None:
-        self._path = path
-        self._file = file
-        self._length = dict(FIXED)
+
+class _Reader(FileReader):
+    """Reads a result."""
 
     def result(self) -> Result:
-        version = self._file.attrs.get("version")
-        if version != VERSION:
-            raise self._error(f"has version {version} of {FORMAT}, this rfpose reads {VERSION}", "process again")
-        scenario = self._scenario()
-        self._length |= {
+        scenario = self.scenario()
+        self.length |= {
             "receiver": len(scenario.receiver_ids),
             "transmitter": len(scenario.transmitter_ids),
             "tone": len(scenario.tone_hz),
@@ -338,35 +324,24 @@ class _Reader:
             ranges=RangeDifferences(**self._group("ranges")),
             fixes=FixTable(**self._group("fixes")),
             poses=PoseTable(**self._group("poses")),
-            **{name: record(**self._group(name)) for name, record in OPTIONAL.items() if name in self._file},
+            **{name: record(**self._group(name)) for name, record in OPTIONAL.items() if name in self.file},
             truth=self._truth(scenario),
         )
 
-    def _error(self, what: str, remedy: str) -> RecordingError:
-        return RecordingError(f"{self._path}: {what}; {remedy}")
-
-    def _scenario(self) -> Scenario:
-        try:
-            return parse_scenario(text_of(self._file, "/scenario"), source=f"{self._path}:/scenario")
-        except ScenarioError as error:
-            raise RecordingError(f"{error}; the result is damaged: process again") from error
-        except ValueError as error:
-            raise self._error(f"`/scenario` {error}", "process again") from error
-
     def _settings(self, scenario: Scenario) -> dict[str, str]:
-        group = find_item(self._file, "/settings", follow_links=False)
+        group = find_item(self.file, "/settings", follow_links=False)
         found = dict(group.attrs.items()) if isinstance(group, h5py.Group) else {}
         for name, value in found.items():
             if not isinstance(value, str):
-                raise self._error(f"attribute `{name}` of `/settings` is no text", "process again")
+                raise self.error("settings", f"has an attribute `{name}` that is no text")
         for name in ("sample_rate", "estimator", "pose"):
             if name not in found:
-                raise self._error(f"`/settings` is missing or lacks `{name}`", "process again")
+                raise self.error("settings", f"is missing or lacks `{name}`")
         try:
             rate_of(found)
             PoseChoice.of(found, scenario)
         except RfposeError as error:
-            raise self._error(f"`/settings`: {error}", "process again") from error
+            raise self.error("settings", f"cannot be: {error}") from error
         return found
 
     def _start_index(self, sample_rate: Fraction) -> npt.NDArray[np.int64]:
@@ -374,24 +349,22 @@ class _Reader:
         late = np.flatnonzero((starts < 0) | (starts > min(LAST_TIME_S * sample_rate, MAX_SAMPLE_INDEX)))
         if late.size:
             value = starts[late[0]]
-            raise self._error(
-                f"`/frames/start_index` [{late[0]}] is {value}, no time until the year 9999", "process again"
-            )
+            raise self.error("frames/start_index", f"[{late[0]}] is {value}, no time until the year 9999")
         back = np.flatnonzero(np.diff(starts) <= 0)
         if back.size:
-            raise self._error(f"`/frames/start_index` [{back[0] + 1}] is not after the one before", "process again")
+            raise self.error("frames/start_index", f"[{back[0] + 1}] is not after the one before")
         return starts
 
     def _group(self, group: str) -> dict[str, npt.NDArray[Any]]:
         return {name: self._array(f"{group}/{name}") for name in _group_keys(group)}
 
     def _truth(self, scenario: Scenario) -> Truth | None:
-        if "truth" not in self._file:
+        if "truth" not in self.file:
             return None
-        arrays = {name: self._array(f"truth/{name}") for name in _group_keys("truth") if name in self._file["truth"]}
+        arrays = {name: self._array(f"truth/{name}") for name in _group_keys("truth") if name in self.file["truth"]}
         for name in ("normal_enu", "receiver_enu_m"):
             if name not in arrays:
-                raise self._error(f"`/truth/{name}` is missing", "process again")
+                raise self.error(f"truth/{name}", "is missing")
         return Truth(
             heliostat_ids=scenario.heliostat_ids,
             receiver_ids=scenario.receiver_ids,
@@ -400,28 +373,9 @@ class _Reader:
         )
 
     def _array(self, path: str) -> npt.NDArray[Any]:
-        key = KEYS[path]
-        dataset = find_item(self._file, f"/{path}", follow_links=False)
-        if not isinstance(dataset, h5py.Dataset):
-            raise self._error(f"`/{path}` is missing", "process again")
-        if dataset.dtype.kind != np.dtype(key.dtype).kind:
-            raise self._error(f"`/{path}` holds {dataset.dtype}, not {np.dtype(key.dtype)}", "process again")
-        expected = tuple(self._length.get(dim) for dim in key.dims)
-        fits = len(expected) == dataset.ndim and all(
-            want is None or want == got for want, got in zip(expected, dataset.shape, strict=True)
-        )
-        if not fits:
-            raise self._error(f"`/{path}` has shape {dataset.shape}, not ({', '.join(key.dims)})", "process again")
-        for dim, got in zip(key.dims, dataset.shape, strict=True):
-            self._length.setdefault(dim, got)
-        try:
-            values = array_of(self._file, f"/{path}", key.dtype)
-        except RecordingError:
-            raise
-        except DAMAGES as error:
-            raise self._error(f"`/{path}` {error}", "process again") from error
+        values = self.array(path, KEYS[path])
         self._check_codes(path, values)
-        return read_only(values)
+        return values
 
     def _check_codes(self, path: str, values: npt.NDArray[Any]) -> None:
         """Refuse codes that mean nothing, and transmitters that do not exist."""
@@ -429,9 +383,9 @@ class _Reader:
         if codes is not None:
             good = np.isin(values, [int(code) for code in codes])
         elif path in _TRANSMITTER_INDEX:
-            good = (values >= -1) & (values < self._length["transmitter"])
+            good = (values >= -1) & (values < self.length["transmitter"])
         else:
             return
         if not good.all():
             at = tuple(int(i) for i in np.argwhere(~good)[0])
-            raise self._error(f"`/{path}` {list(at)} is {values[at]}, which means nothing", "process again")
+            raise self.error(path, f"{list(at)} is {values[at]}, which means nothing")

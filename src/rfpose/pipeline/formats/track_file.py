@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
 from rfpose.feedback.tracking._kernels import RADIO
@@ -25,7 +25,7 @@ from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
 from rfpose.foreign import parse_json
-from rfpose.kinds import check_kind, kind_of
+from rfpose.kinds import kind_of
 from rfpose.pipeline.formats.columns import (
     ENU,
     Column,
@@ -36,11 +36,11 @@ from rfpose.pipeline.formats.columns import (
     text_label,
     write_names,
 )
-from rfpose.pipeline.formats.hdf5_values import DAMAGES, array_of, text_of
+from rfpose.pipeline.formats.hdf5_values import DAMAGES, FileReader, opened, text_of
 from rfpose.pipeline.formats.result import LAST_TIME_S
 from rfpose.pipeline.track_iq import IqCheck
 from rfpose.recording.hdf5 import find_item
-from rfpose.scenario import Scenario, parse_scenario
+from rfpose.scenario import Scenario
 from rfpose.shown import Shown, counted, number, plain
 from rfpose.tables import Tabled
 
@@ -64,41 +64,40 @@ VERSION = 2
 
 _SEASONS = {"Dec-Feb": (12, 1, 2), "Mar-May": (3, 4, 5), "Jun-Aug": (6, 7, 8), "Sep-Nov": (9, 10, 11)}
 _SERIES = {
-    "rms_rad": Column(("time",), "", "rad", "normal error over the field at that instant, rms"),
-    "p95_rad": Column(("time",), "", "rad", "the same, 95 %"),
-    "worst_rad": Column(("time",), "", "rad", "the same, worst mirror"),
-    "normal_enu": Column(("time", "stored", "xyz"), "", "1", "true normals of the stored mirrors"),
-    "error_rad": Column(("time", "stored"), "", "rad", "angle between true and wanted normal"),
-    "motor_count": Column(("time", "stored", "axis"), "", "steps", "motor positions"),
+    "rms_rad": Column(("time",), "f8", "rad", "normal error over the field at that instant, rms"),
+    "p95_rad": Column(("time",), "f8", "rad", "the same, 95 %"),
+    "worst_rad": Column(("time",), "f8", "rad", "the same, worst mirror"),
+    "normal_enu": Column(("time", "stored", "xyz"), "f8", "1", "true normals of the stored mirrors"),
+    "error_rad": Column(("time", "stored"), "f8", "rad", "angle between true and wanted normal"),
+    "motor_count": Column(("time", "stored", "axis"), "f8", "steps", "motor positions"),
     "shift_enu": Column(
-        ("time", "stored", "xyz"), "", "rad", "what feedback adds to the normal that the model is asked for"
+        ("time", "stored", "xyz"), "f8", "rad", "what feedback adds to the normal that the model is asked for"
     ),
-    "flux": Column(("time",), "", "1", "light on the receiver over that of a perfect field on its aim"),
-    "mode_count": Column(("time", "mode_name"), "", "1", "mirrors in each mode, numbered as under mode/name"),
-    "mode": Column(("time", "stored"), "", "", "modes of the stored mirrors", Mode),
+    "flux": Column(("time",), "f8", "1", "light on the receiver over that of a perfect field on its aim"),
+    "mode_count": Column(("time", "mode_name"), "i4", "1", "mirrors in each mode, numbered as under mode/name"),
+    "mode": Column(("time", "stored"), "i1", "", "modes of the stored mirrors", Mode),
 }
 _SCORES = {
-    "heliostat_rms_rad": Column(("heliostat",), "", "rad", "normal error, rms over all days"),
-    "heliostat_p95_rad": Column(("heliostat",), "", "rad", "normal error, 95 %"),
-    "heliostat_worst_rad": Column(("heliostat",), "", "rad", "normal error, worst"),
+    "heliostat_rms_rad": Column(("heliostat",), "f8", "rad", "normal error, rms over all days"),
+    "heliostat_p95_rad": Column(("heliostat",), "f8", "rad", "normal error, 95 %"),
+    "heliostat_worst_rad": Column(("heliostat",), "f8", "rad", "normal error, worst"),
     "heliostat_intercept": Column(
-        ("heliostat",), "", "1", "light caught over light that a perfect tracker would catch"
+        ("heliostat",), "f8", "1", "light caught over light that a perfect tracker would catch"
     ),
-    "hour_rms_rad": Column(("hour",), "", "rad", "normal error by hour of local mean solar time"),
-    "day_rms_rad": Column(("day",), "", "rad", "normal error by day"),
-    "day_worst_heliostat_rad": Column(("day",), "", "rad", "rms of the day's worst mirror"),
-    "day_intercept": Column(("day",), "", "1", "by day"),
-    "by_mode": Column(("mode_name", "total"), "", "s, J/m²", "time and light of a mirror in each mode, all days"),
+    "hour_rms_rad": Column(("hour",), "f8", "rad", "normal error by hour of local mean solar time"),
+    "day_rms_rad": Column(("day",), "f8", "rad", "normal error by day"),
+    "day_worst_heliostat_rad": Column(("day",), "f8", "rad", "rms of the day's worst mirror"),
+    "day_intercept": Column(("day",), "f8", "1", "by day"),
+    "by_mode": Column(("mode_name", "total"), "f8", "s, J/m²", "time and light of a mirror in each mode, all days"),
 }
-_INTEGERS = ("mode_count", "mode", "stored", "day")
 MODE_NAMES = tuple(mode.name.lower() for mode in Mode)
 _FIELD = {
-    "heliostat/pivot_enu_m": Column(("heliostat", "xyz"), "", "m", "nominal pivots"),
-    "heliostat/target_enu_m": Column(("heliostat", "xyz"), "", "m", "aim points; NaN for a dish"),
-    "heliostat/stored": Column(("stored",), "", "index", "row of each stored mirror"),
-    "time/unix_s": Column(("time",), "", "s", "instants of the series, UTC"),
-    "time/day": Column(("time",), "", "index", "which day each belongs to"),
-    "time/sun_enu": Column(("time", "xyz"), "", "1", "towards the sun"),
+    "heliostat/pivot_enu_m": Column(("heliostat", "xyz"), "f8", "m", "nominal pivots"),
+    "heliostat/target_enu_m": Column(("heliostat", "xyz"), "f8", "m", "aim points; NaN for a dish"),
+    "heliostat/stored": Column(("stored",), "i8", "index", "row of each stored mirror"),
+    "time/unix_s": Column(("time",), "f8", "s", "instants of the series, UTC"),
+    "time/day": Column(("time",), "i8", "index", "which day each belongs to"),
+    "time/sun_enu": Column(("time", "xyz"), "f8", "1", "towards the sun"),
 }
 
 
@@ -399,21 +398,12 @@ def open_track(path: str | Path) -> Track:
     >>> rf.open_track("day.h5").to_pandas()  # doctest: +SKIP
     """
     path = Path(path)
-    check_kind(path, wanted="track")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("version") != VERSION:
-                raise RecordingError(f"{path}: is no {FORMAT} of version {VERSION}; {_AGAIN}")
-            return _Reader(path, file).track()
-    except RecordingError:
-        raise
-    except DAMAGES as error:
-        raise RecordingError(
-            f"{path}: cannot be read as {FORMAT} ({error}); it is truncated or another kind of file: {_AGAIN}"
-        ) from error
+    with opened(path, wanted="track", version=VERSION, again=_AGAIN) as file:
+        return _Reader(path, file, length=_LENGTH, again=_AGAIN).track()
 
 
 _AGAIN = "run `rfpose track` again"
+_LENGTH = {"xyz": 3, "axis": 2, "hour": 24, "mode_name": len(Mode), "total": 3}
 
 
 class _Checked(BaseModel):
@@ -486,117 +476,81 @@ _TABLES = TypeAdapter(list[dict[str, Any]])
 _SUMMARY = TypeAdapter(_Summary)
 
 
-class _Reader:
-    """Reads one open file; each complaint names the file and the place in it."""
-
-    def __init__(self, path: Path, file: h5py.File) -> None:
-        self._path = path
-        self._file = file
-        self._length = {"xyz": 3, "axis": 2, "hour": 24, "mode_name": len(Mode), "total": 3}
+class _Reader(FileReader):
+    """Reads a tracking run."""
 
     def track(self) -> Track:
         ids, dates = self._names("heliostat/id"), self._names("day/date")
-        self._length |= {"heliostat": len(ids), "day": len(dates)}
-        field = {place.partition("/")[2]: self._array(place, column) for place, column in _FIELD.items()}
+        self.length |= {"heliostat": len(ids), "day": len(dates)}
+        field = {place.partition("/")[2]: self.array(place, column) for place, column in _FIELD.items()}
         self._check_index("heliostat/stored", field["stored"], 0, len(ids))
         self._check_index("time/day", field["day"], 0, len(dates))
         late = ~((field["unix_s"] >= 0.0) & (field["unix_s"] <= LAST_TIME_S))
         if late.any():
-            raise self._error("time/unix_s", f"holds {field['unix_s'][late][0]}, no time until the year 9999")
+            raise self.error("time/unix_s", f"holds {field['unix_s'][late][0]}, no time until the year 9999")
         for date in dates:
             try:
                 datetime.date.fromisoformat(date)
             except ValueError as error:
-                raise self._error("day/date", f"holds {date!r:.40}, which is no date") from error
-        settings = {name: str(value) for name, value in self._group("settings").attrs.items()}
+                raise self.error("day/date", f"holds {date!r:.40}, which is no date") from error
+        settings = {name: str(value) for name, value in self.group("settings").attrs.items()}
         if not re.fullmatch(r"[0-9]{1,20}", settings.get("seed", "")):
-            raise self._error("settings", "lacks the attribute `seed`, or it is no number")
-        try:
-            scenario = parse_scenario(text_of(self._file, "/scenario"), source=f"{self._path}:/scenario")
-        except ScenarioError as error:
-            raise RecordingError(f"{error}; the run is damaged: {_AGAIN}") from error
-        except ValueError as error:
-            raise self._error("scenario", str(error)) from error
+            raise self.error("settings", "lacks the attribute `seed`, or it is no number")
         return Track(
-            scenario=scenario,
+            scenario=self.scenario(),
             settings=settings,
             heliostat_ids=ids,
             dates=dates,
-            methods={name: self._method(name) for name in self._json(_TEXTS, "methods", self._file)},
+            methods={name: self._method(name) for name in self._json(_TEXTS, "methods", self.file)},
             iq=tuple(self._json(_TABLES, "iq")),
             **field,
         )
 
     def _method(self, name: str) -> MethodTrack:
         place = f"method/{name}"
-        group = self._group(place)
-        series = {key: self._array(f"{place}/{key}", column) for key, column in _SERIES.items()}
+        group = self.group(place)
+        series = {key: self.array(f"{place}/{key}", column) for key, column in _SERIES.items()}
         self._check_index(f"{place}/mode", series["mode"], -1, len(Mode))
         return MethodTrack(
             name=name,
             text=str(group.attrs.get("text", METHODS[name].text if name in METHODS else name)),
             series=series,
-            scores={key: self._array(f"{place}/score/{key}", column) for key, column in _SCORES.items()},
+            scores={key: self.array(f"{place}/score/{key}", column) for key, column in _SCORES.items()},
             summary=self._json(_SUMMARY, f"{place} summary", group),
             happened=tuple(self._json(_HAPPENED, f"{place}/happened")),
         )
 
-    def _error(self, place: str, what: str) -> RecordingError:
-        return RecordingError(f"{self._path}: `/{place}` {what}; the run is damaged: {_AGAIN}")
-
-    def _group(self, place: str) -> h5py.Group:
-        found = find_item(self._file, f"/{place}", follow_links=False)
-        if not isinstance(found, h5py.Group):
-            raise self._error(place, "is missing or no group")
-        return found
-
     def _names(self, place: str) -> tuple[str, ...]:
-        dataset = find_item(self._file, f"/{place}", follow_links=False)
+        dataset = find_item(self.file, f"/{place}", follow_links=False)
         if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or not h5py.check_string_dtype(dataset.dtype):
-            raise self._error(place, "is missing or no list of texts")
+            raise self.error(place, "is missing or no list of texts")
         try:
             return tuple(dataset.asstr()[()].tolist())
         except RecordingError:
             raise
         except DAMAGES as error:
-            raise self._error(place, f"cannot be read ({error})") from error
+            raise self.error(place, f"cannot be read ({error})") from error
 
     def _json(self, wanted: TypeAdapter[Any], place: str, group: h5py.Group | None = None) -> Any:
         """Return what a text says; that of an attribute of ``group``, named by the place's last word, if given."""
         try:
-            raw = text_of(self._file, f"/{place}") if group is None else group.attrs[place.rpartition(" ")[2]]
+            raw = text_of(self.file, f"/{place}") if group is None else group.attrs[place.rpartition(" ")[2]]
         except RecordingError:
             raise
         except DAMAGES as error:
-            raise self._error(place, f"is missing or no text ({error})") from error
+            raise self.error(place, f"is missing or no text ({error})") from error
         if not isinstance(raw, str):
-            raise self._error(place, "is no text")
-        found = parse_json(raw, source=f"{self._path}: `/{place}`", remedy=f"the run is damaged: {_AGAIN}")
+            raise self.error(place, "is no text")
+        found = parse_json(raw, source=f"{self.path}: `/{place}`", remedy=f"the file is damaged: {_AGAIN}")
         try:
             wanted.validate_python(found)
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise self._error(place, f"`{where}`: {first['msg'][:1].lower()}{first['msg'][1:]}") from error
+            raise self.error(place, f"`{where}`: {first['msg'][:1].lower()}{first['msg'][1:]}") from error
         return found
-
-    def _array(self, place: str, column: Column) -> npt.NDArray[Any]:
-        dataset = find_item(self._file, f"/{place}", follow_links=False)
-        name = place.rpartition("/")[2]
-        kind = "iu" if name in _INTEGERS else "f"
-        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in kind:
-            raise self._error(place, f"is missing or holds no {'integers' if kind == 'iu' else 'numbers'}")
-        lengths = [self._length.setdefault(dim, n) for dim, n in zip(column.dims, dataset.shape, strict=False)]
-        if len(column.dims) != dataset.ndim or tuple(lengths) != dataset.shape:
-            raise self._error(place, f"has shape {dataset.shape}, not ({', '.join(column.dims)})")
-        try:
-            return read_only(array_of(self._file, f"/{place}", dataset.dtype.newbyteorder("=")))
-        except RecordingError:
-            raise
-        except DAMAGES as error:
-            raise self._error(place, str(error)) from error
 
     def _check_index(self, place: str, values: npt.NDArray[Any], least: int, end: int) -> None:
         bad = values[(values < least) | (values >= end)]
         if bad.size:
-            raise self._error(place, f"holds {bad[0]}, which means nothing")
+            raise self.error(place, f"holds {bad[0]}, which means nothing")

@@ -14,7 +14,6 @@ from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, RfposeError, ScenarioError
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.fields import radial_staggered
 from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
 from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
 from rfpose.measurement import SCENARIO
@@ -35,7 +34,6 @@ __all__ = [
     "free_carrier_hz",
     "place_transmitters",
     "scenario_of_layout",
-    "staggered_field",
     "sun_of",
 ]
 
@@ -132,11 +130,6 @@ def field_of(scenario: Scenario) -> FloatArray:
 def field_from_csv(path: str | Path) -> FloatArray:
     """Return pivots (heliostat, xyz) from a table; see `rfpose.scenario.read_positions`."""
     return read_positions(path)[1]
-
-
-def staggered_field(n_heliostat: int, *, first_radius_m: float, diagonal_m: float, height_m: float) -> FloatArray:
-    """Return a radially staggered field (heliostat, xyz) about the origin [m]."""
-    return radial_staggered(n_heliostat, first_radius_m=first_radius_m, diagonal_m=diagonal_m, height_m=height_m)
 
 
 def first_choice(scenario: Scenario) -> LayoutChoice:
