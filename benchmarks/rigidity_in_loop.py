@@ -70,7 +70,7 @@ def rms_mrad(scenario: Scenario, method: str, mirrors: int) -> float:
         simulation.advance()
     square = score(simulation.sums(method)).normal_rms_rad ** 2
     if method == "open-loop":
-        square -= float(np.sum((simulation.gusts.mean_mps**2 * simulation.gusts.bend) ** 2))
+        square -= float(np.sum((simulation.plant.gusts.mean_mps**2 * simulation.plant.gusts.bend) ** 2))
     return 1e3 * float(np.sqrt(square))
 
 
