@@ -24,6 +24,7 @@ class PoseStatus(IntEnum):
     UNKNOWNS = 8
     UNCERTAIN = 9
     AMBIGUOUS = 10
+    NO_POSTURE = 11
 
     @property
     def reason(self) -> str:
@@ -45,6 +46,7 @@ _REASON = {
     "known delays would help",
     PoseStatus.AMBIGUOUS: "two poses fit alike, mirrored in the transmitters' plane; transmitters of unequal heights "
     "or a surveyed pivot would tell",
+    PoseStatus.NO_POSTURE: "no commanded posture to begin from: give a [posture] table, or a posture file",
     PoseStatus.UNKNOWNS: "fewer measurements than unknowns: more transmitters received, a surveyed pivot, a mount or "
     "known delays would help",
 }

@@ -1,0 +1,21 @@
+"""Poses outdoors: carriers compared between a mirror's receivers, with the rays in the model that geometry foresees."""
+
+from rfpose.multilat.site.fit import (
+    SiteKnowledge,
+    SiteObservations,
+    SitePoses,
+    SiteSettings,
+    Voltages,
+    fit_site,
+    spread_starts,
+)
+
+__all__ = [
+    "SiteKnowledge",
+    "SiteObservations",
+    "SitePoses",
+    "SiteSettings",
+    "Voltages",
+    "fit_site",
+    "spread_starts",
+]

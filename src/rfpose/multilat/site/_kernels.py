@@ -1,0 +1,393 @@
+"""Poses from the carriers of a mirror's receivers, with foreseen rays in the model; see ``fit.py`` for the model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rfpose.jit import kernel, kernel_rows
+
+_MAX_STEP_RAD = 0.05
+_SETTLED_SIGMAS = 2e-2
+_SETTLED_WEIGHT = 5e-2
+_ENDED_SIGMAS = 0.2
+"""A fit that reweighting still moves by less than this is taken as it is: weights settle slowly."""
+_MIN_STEPS = 5
+_FREE = 1e-3
+"""Information on what nothing is known of, so that equations stay regular: 30 m, 30 rad."""
+
+
+@kernel
+def turn(w, out):
+    """Rotation matrix of a rotation vector (Rodrigues)."""
+    angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+    a = 1.0 - angle**2 / 6.0 if angle < 1e-4 else np.sin(angle) / angle
+    b = 0.5 - angle**2 / 24.0 if angle < 1e-4 else (1.0 - np.cos(angle)) / angle**2
+    x, y, z = w
+    out[0, 0] = 1.0 - b * (y * y + z * z)
+    out[0, 1] = -a * z + b * x * y
+    out[0, 2] = a * y + b * x * z
+    out[1, 0] = a * z + b * x * y
+    out[1, 1] = 1.0 - b * (x * x + z * z)
+    out[1, 2] = -a * x + b * y * z
+    out[2, 0] = -a * y + b * x * z
+    out[2, 1] = a * x + b * y * z
+    out[2, 2] = 1.0 - b * (x * x + y * y)
+
+
+@kernel
+def turn_between(rot_to, rot_from, out):
+    """Rotation vector that takes one orientation to another: small angles, as they are here."""
+    r = rot_to @ rot_from.T
+    out[0] = 0.5 * (r[2, 1] - r[1, 2])
+    out[1] = 0.5 * (r[0, 2] - r[2, 0])
+    out[2] = 0.5 * (r[1, 0] - r[0, 1])
+    sine = np.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+    if sine > 1e-9:
+        cosine = 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)
+        out *= np.arctan2(sine, cosine) / sine
+
+
+@kernel
+def cholesky(a, n):
+    """Replace the lower triangle of a by its Cholesky factor; false where it is not positive definite."""
+    for j in range(n):
+        s = a[j, j]
+        for k in range(j):
+            s -= a[j, k] * a[j, k]
+        if not s > 0.0:
+            return False
+        d = np.sqrt(s)
+        a[j, j] = d
+        for i in range(j + 1, n):
+            s = a[i, j]
+            for k in range(j):
+                s -= a[i, k] * a[j, k]
+            a[i, j] = s / d
+    return True
+
+
+@kernel
+def forward(lower, n, rhs, n_column):
+    """Solve lower · x = rhs in place, column by column together."""
+    for i in range(n):
+        for k in range(i):
+            f = lower[i, k]
+            for c in range(n_column):
+                rhs[i, c] -= f * rhs[k, c]
+        f = 1.0 / lower[i, i]
+        for c in range(n_column):
+            rhs[i, c] *= f
+
+
+@kernel
+def voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h):
+    """What each link receives and its slope with the pose (rotation vector, then pivot).
+
+    ``part[k - begin]`` becomes the voltage of ray k. Links are numbered within the mirror.
+    """
+    h[:] = 0.0
+    slope_h[:] = 0.0
+    for k in range(begin, end):
+        link = link_of[k]
+        wave = k_tx[link % n_tx]
+        y0 = rot[0, 0] * place[k, 0] + rot[0, 1] * place[k, 1] + rot[0, 2] * place[k, 2]
+        y1 = rot[1, 0] * place[k, 0] + rot[1, 1] * place[k, 1] + rot[1, 2] * place[k, 2]
+        y2 = rot[2, 0] * place[k, 0] + rot[2, 1] * place[k, 1] + rot[2, 2] * place[k, 2]
+        u0 = source[k, 0] - pivot[0] - y0
+        u1 = source[k, 1] - pivot[1] - y1
+        u2 = source[k, 2] - pivot[2] - y2
+        length = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
+        u0, u1, u2 = u0 / length, u1 / length, u2 / length
+        phase = wave * (length + extra[k])
+        turned = complex(np.cos(phase), -np.sin(phase))
+        now = voltage[k] + slope[k, 0] * moved[0] + slope[k, 1] * moved[1] + slope[k, 2] * moved[2]
+        v = now * turned
+        part[k - begin] = v
+        h[link] += v
+        g = 1j * wave * v
+        slope_h[link, 0] += g * (y1 * u2 - y2 * u1) + slope[k, 0] * turned
+        slope_h[link, 1] += g * (y2 * u0 - y0 * u2) + slope[k, 1] * turned
+        slope_h[link, 2] += g * (y0 * u1 - y1 * u0) + slope[k, 2] * turned
+        slope_h[link, 3] += g * u0
+        slope_h[link, 4] += g * u1
+        slope_h[link, 5] += g * u2
+
+
+@kernel
+def add_factor_errors(begin, end, order, group, link_of, amplitude_error, phase_error, part, h, row_of, share, touched, s):
+    """Add to the covariance s what rays' uncertain factors do to phases; rays in order, those of a group together."""
+    k = begin
+    while k < end:
+        now = group[order[k]]
+        n_touched = 0
+        first = order[k]
+        while k < end and group[order[k]] == now:
+            ray = order[k]
+            k += 1
+            row = row_of[link_of[ray]]
+            if now < 0 or row < 0:
+                continue
+            if share[row] == 0.0:
+                touched[n_touched] = row
+                n_touched += 1
+            share[row] += part[ray - begin] / h[link_of[ray]]
+        amp, pha = amplitude_error[first] ** 2, phase_error[first] ** 2
+        for i in range(n_touched):
+            a = share[touched[i]]
+            for j in range(n_touched):
+                b = share[touched[j]]
+                s[touched[i], touched[j]] += amp * a.imag * b.imag + pha * a.real * b.real
+        for i in range(n_touched):
+            share[touched[i]] = 0.0
+
+
+@kernel
+def wrapped(x):
+    """In (−π, π]."""
+    return np.pi - np.mod(np.pi - x, 2.0 * np.pi)
+
+
+@kernel_rows
+def fit_mirrors(
+    begin_row, end_row, rows, carrier, sigma, k_tx, unit_field, first, link_of, source, place, extra, voltage, slope,
+    order, group, amplitude_error, phase_error, reference_rot, start_pivot, start_rot, surveyed, pivot_info,
+    commanded_rot, posture_info, roll_info, clock_info, floor, nu, own_scale, max_steps,
+    out_pivot, out_rot, out_cov, out_weight, out_residual, out_sigma, out_scale, out_sum, out_dof, out_cost, out_steps,
+):  # fmt: skip
+    """Fit the pose of each mirror; see ``fit.fit_site`` for arguments, ``out_*`` for what it gives."""
+    n_rx, n_tx = carrier.shape[1], carrier.shape[2]
+    n_link = n_rx * n_tx
+    n_clock = n_rx if np.isfinite(clock_info) else 0
+    n_par = 6 + n_tx + n_clock
+    h = np.empty(n_link, np.complex128)
+    slope_h = np.empty((n_link, 6), np.complex128)
+    row_of = np.empty(n_link, np.int64)
+    link_at = np.empty(n_link, np.int64)
+    share = np.zeros(n_link, np.complex128)
+    touched = np.empty(n_link, np.int64)
+    s = np.empty((n_link, n_link))
+    lower = np.empty((n_link, n_link))
+    a = np.empty((n_link, n_par + 1))
+    inverse = np.empty((n_link, n_link))
+    size = np.empty(n_link)
+    variance = np.empty(n_link)
+    weight = np.empty(n_link)
+    residual = np.empty(n_link)
+    normal = np.empty((n_par, n_par))
+    normal_lower = np.empty((n_par, n_par))
+    gradient = np.empty((n_par, 1))
+    own = np.empty(n_link)
+    part_dof = np.empty(n_link)
+    seen = np.empty(n_par)
+    step_rot = np.empty((3, 3))
+    moved = np.empty(3)
+    off = np.empty(3)
+    beta = np.empty(n_tx, np.complex128)
+    gain_a, gain_b = np.empty(n_tx), np.empty(n_tx)
+    for i_row in range(begin_row, end_row):
+        m = rows[i_row]
+        begin, end = first[m * n_link], first[(m + 1) * n_link]
+        part = np.empty(max(end - begin, 1), np.complex128)
+        pivot, rot = start_pivot[m].copy(), start_rot[m].copy()
+        out_steps[m] = -1
+        # which links are received and foreseen
+        turn_between(rot, reference_rot[m], moved)
+        voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h)
+        n = 0
+        for link in range(n_link):
+            c = carrier[m, link // n_tx, link % n_tx]
+            row_of[link] = -1
+            if np.isfinite(c.real) and np.isfinite(c.imag) and abs(c) > 0.0 and abs(h[link]) > 0.0:
+                row_of[link] = n
+                link_at[n] = link
+                size[n] = abs(c)
+                n += 1
+        if n < 6:
+            continue
+        weight[:n] = 1.0
+        scale = 1.0
+        failed = False
+        n_step = 0
+        length = np.inf
+        for n_step in range(max_steps):
+            turn_between(rot, reference_rot[m], moved)
+            voltages(
+                begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h
+            )
+            # amplitude of each transmitter, so that the floor is relative to its direct field
+            gain_a[:], gain_b[:] = 0.0, 0.0
+            for i in range(n):
+                t = link_at[i] % n_tx
+                gain_a[t] += weight[i] * size[i] * abs(h[link_at[i]])
+                gain_b[t] += weight[i] * abs(h[link_at[i]]) ** 2
+            if n_step == 0:
+                beta[:] = 0.0
+            for i in range(n):
+                link = link_at[i]
+                t = link % n_tx
+                r = link // n_tx
+                stray = floor * gain_a[t] / gain_b[t] * unit_field[m, t]
+                variance[i] = (sigma[m, r, t] ** 2 + scale * stray**2) / size[i] ** 2
+                residual[i] = np.angle(carrier[m, r, t]) - np.angle(h[link])
+                if n_step == 0:
+                    beta[t] += complex(np.cos(residual[i]), np.sin(residual[i])) / variance[i]
+            s[:n, :n] = 0.0
+            for i in range(n):
+                link = link_at[i]
+                t, r = link % n_tx, link // n_tx
+                a[i, :] = 0.0
+                for q in range(6):
+                    a[i, q] = (slope_h[link, q] / h[link]).imag
+                a[i, 6 + t] = 1.0
+                if n_clock:
+                    a[i, 6 + n_tx + r] = -k_tx[t]
+                residual[i] = wrapped(residual[i] - np.angle(beta[t]))
+                a[i, n_par] = residual[i]
+                s[i, i] = variance[i] / weight[i]
+            add_factor_errors(
+                begin, end, order, group, link_of, amplitude_error, phase_error, part, h, row_of, share, touched, s
+            )
+            lower[:n, :n] = s[:n, :n]
+            if not cholesky(lower, n):
+                failed = True
+                break
+            forward(lower, n, a, n_par + 1)
+            for p in range(n_par):
+                for q in range(p + 1):
+                    t_sum = 0.0
+                    for i in range(n):
+                        t_sum += a[i, p] * a[i, q]
+                    normal[p, q] = t_sum
+                    normal[q, p] = t_sum
+                t_sum = 0.0
+                for i in range(n):
+                    t_sum += a[i, p] * a[i, n_par]
+                gradient[p, 0] = t_sum
+            # priors: posture, mount, pivot, clocks
+            turn_between(commanded_rot[m], rot, off)
+            for q in range(3):
+                normal[q, q] += posture_info
+                gradient[q, 0] += posture_info * off[q]
+                normal[3 + q, 3 + q] += pivot_info
+                gradient[3 + q, 0] += pivot_info * (surveyed[m, q] - pivot[q])
+            tilt = (rot[1, 0], -rot[0, 0])  # of the x axis out of the horizontal, by a turn about east and north
+            for p in range(2):
+                gradient[p, 0] -= roll_info * tilt[p] * rot[2, 0]
+                for q in range(2):
+                    normal[p, q] += roll_info * tilt[p] * tilt[q]
+            for t in range(n_tx):
+                normal[6 + t, 6 + t] += _FREE
+            for r in range(n_clock):
+                normal[6 + n_tx + r, 6 + n_tx + r] += max(clock_info, _FREE)
+            normal_lower[:] = normal
+            if not cholesky(normal_lower, n_par):
+                failed = True
+                break
+            forward(normal_lower, n_par, gradient, 1)
+            for p in range(n_par - 1, -1, -1):
+                x = gradient[p, 0]
+                for q in range(p + 1, n_par):
+                    x -= normal_lower[q, p] * gradient[q, 0]
+                gradient[p, 0] = x / normal_lower[p, p]
+            angle = np.sqrt(gradient[0, 0] ** 2 + gradient[1, 0] ** 2 + gradient[2, 0] ** 2)
+            length = 0.0  # of the step, in standard deviations; clocks are solved for anew each time
+            for p in range(6 + n_tx):
+                for q in range(6 + n_tx):
+                    length += gradient[p, 0] * normal[p, q] * gradient[q, 0]
+            shrink = min(1.0, _MAX_STEP_RAD / max(angle, 1e-300))
+            turn(shrink * gradient[:3, 0], step_rot)
+            rot = step_rot @ rot
+            for q in range(3):
+                pivot[q] += shrink * gradient[3 + q, 0]
+            for t in range(n_tx):
+                beta[t] *= complex(np.cos(gradient[6 + t, 0]), np.sin(gradient[6 + t, 0]))
+            # what is left, less what the rays' factors explain: D S⁻¹ (b − A d)
+            for i in range(n):
+                own[i] = a[i, n_par]
+                for p in range(n_par):
+                    own[i] -= a[i, p] * gradient[p, 0]
+            for i in range(n - 1, -1, -1):
+                for k in range(i + 1, n):
+                    own[i] -= lower[k, i] * own[k]
+                own[i] /= lower[i, i]
+            change = 0.0
+            total = 0.0
+            for i in range(n):
+                e = own[i] * variance[i] / weight[i]
+                residual[i] = e
+                total += weight[i] * e * e / variance[i]
+            # degrees of freedom of what is left: trace of D (S⁻¹ − S⁻¹ A N⁻¹ Aᵀ S⁻¹)
+            inverse[:n, :n] = 0.0
+            for i in range(n):
+                inverse[i, i] = 1.0
+            forward(lower, n, inverse[:, :n], n)
+            dof = 0.0
+            for i in range(n):
+                d = 0.0
+                for k in range(i, n):
+                    d += inverse[k, i] ** 2
+                part_dof[i] = d * variance[i] / weight[i]
+            for i in range(n):
+                for p in range(n_par):
+                    x = 0.0
+                    for k in range(i, n):
+                        x += inverse[k, i] * a[k, p]
+                    seen[p] = x
+                for p in range(n_par):
+                    x = seen[p]
+                    for q in range(p):
+                        x -= normal_lower[p, q] * seen[q]
+                    seen[p] = x / normal_lower[p, p]
+                    part_dof[i] -= seen[p] ** 2 * variance[i] / weight[i]
+                dof += part_dof[i]
+            for i in range(n):
+                # of e²'s expectation: what is left may be anywhere within what the others leave open
+                open_part = max(1.0 - part_dof[i], 0.0) / weight[i]
+                new = (nu + 1.0) / (nu + residual[i] ** 2 / variance[i] + open_part)
+                change = max(change, abs(new - weight[i]))
+                weight[i] = 0.5 * (weight[i] + new)
+            if own_scale > 0.0 and n_step >= 2:
+                new_scale = (own_scale + scale * total) / (own_scale + max(dof, 0.0))
+                change = max(change, abs(np.log(new_scale / scale)))
+                scale = np.sqrt(scale * new_scale)
+            if n_step >= _MIN_STEPS and length < _SETTLED_SIGMAS**2 and change < _SETTLED_WEIGHT:
+                break
+        if failed:
+            continue
+        cost = 0.0
+        for i in range(n):
+            cost += (nu + 1.0) * np.log1p(residual[i] ** 2 / (nu * variance[i])) + np.log(variance[i])
+        # of the rays' factors: vᵀ (S − D) v with v = S⁻¹ r
+        quadratic = 0.0
+        for i in range(n):
+            left = a[i, n_par]
+            for p in range(n_par):
+                left -= a[i, p] * gradient[p, 0]
+            quadratic += left * left
+            quadratic -= residual[i] * own[i]
+        cost += quadratic
+        turn_between(commanded_rot[m], rot, off)
+        for q in range(3):
+            cost += posture_info * off[q] ** 2 + pivot_info * (surveyed[m, q] - pivot[q]) ** 2
+        out_cost[m] = cost
+        out_pivot[m], out_rot[m] = pivot, rot
+        out_scale[m] = scale
+        out_sum[m] = scale * total
+        out_dof[m] = dof
+        out_steps[m] = n_step if length < _ENDED_SIGMAS**2 else max_steps
+        for p in range(6):
+            gradient[:, 0] = 0.0
+            gradient[p, 0] = 1.0
+            forward(normal_lower, n_par, gradient, 1)
+            for q in range(n_par - 1, -1, -1):
+                x = gradient[q, 0]
+                for k in range(q + 1, n_par):
+                    x -= normal_lower[k, q] * gradient[k, 0]
+                gradient[q, 0] = x / normal_lower[q, q]
+            for q in range(6):
+                out_cov[m, q, p] = gradient[q, 0]
+        for i in range(n):
+            r, t = link_at[i] // n_tx, link_at[i] % n_tx
+            out_weight[m, r, t] = weight[i]
+            out_residual[m, r, t] = residual[i]
+            out_sigma[m, r, t] = np.sqrt(variance[i])

@@ -1,0 +1,495 @@
+r"""Poses of mirrors among reflections, from their receivers' carriers.
+
+What receiver r of a mirror hears of transmitter i is, up to a complex number a transmitter and mirror,
+
+.. math:: h_{ri}(p, R) = \sum_k v_k\, e^{-j k_i |s_k - p - R m_k|}
+
+over the rays that are foreseen, v their voltages. The phases of the carriers are compared with those of h. What nothing
+foresees is a stray field of the same strength in all links, `SiteSettings.floor` times the transmitter's direct field;
+it turns the phase of a weak link more than that of a strong one. Its distribution has heavy tails (Student's t, by
+reweighting), so that single links that are far off hardly count, and its strength is found from residuals, over all
+mirrors and, about that, for each mirror. Factors of foreseen rays are uncertain; rays that share one have that error in
+common, and it goes into the covariance of the phases instead of being estimated.
+
+References
+----------
+Lange, Little, Taylor, Robust statistical modeling using the t distribution, J. Am. Stat. Assoc. 84 (1989) 881, for the
+reweighting and its covariance; Patterson and Thompson, Recovery of inter-block information when block sizes are
+unequal, Biometrika 58 (1971) 545, for scales by restricted likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import fdtri
+
+from rfpose.checks import FloatArray
+from rfpose.errors import InvalidInputError
+from rfpose.multilat.normal import MAX_SIGMA_RAD
+from rfpose.multilat.site import _kernels
+from rfpose.multilat.status import PoseStatus
+from rfpose.propagation import RayKind, Rays
+
+__all__ = [
+    "SiteKnowledge",
+    "SiteObservations",
+    "SitePoses",
+    "SiteSettings",
+    "Voltages",
+    "fit_site",
+    "spread_starts",
+]
+
+BoolArray = npt.NDArray[np.bool_]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+_MAX_STEPS = 40
+_FLOOR_ROUNDS = 12
+_FLOOR_SETTLED = 0.02
+_FLOOR_MIRRORS = 400
+"""Mirrors, spread over all, from which the common floor is found."""
+_AMBIGUOUS_COST = 9.0
+"""Two poses apart whose costs (twice the log likelihood) differ by less may each be the true one."""
+_TELLING = 3
+"""Fewer links than this beyond those that a pose takes confirm none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteObservations:
+    """What is measured of mirrors.
+
+    Attributes
+    ----------
+    carrier : (mirror, receiver, transmitter)
+        Complex amplitude of each carrier [any unit]; NaN: not received.
+    sigma : (mirror, receiver, transmitter)
+        Standard deviation of its real part, same unit.
+    wavenumber_radpm : (transmitter,)
+        2π/λ of each carrier [rad/m].
+    """
+
+    carrier: ComplexArray
+    sigma: FloatArray
+    wavenumber_radpm: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.carrier.ndim != 3 or self.sigma.shape != self.carrier.shape:
+            raise InvalidInputError(
+                f"`carrier` and `sigma` must have one shape (mirror, receiver, transmitter), got {self.carrier.shape} "
+                f"and {self.sigma.shape}"
+            )
+        if self.wavenumber_radpm.shape != self.carrier.shape[2:] or not np.all(self.wavenumber_radpm > 0.0):
+            raise InvalidInputError("`wavenumber_radpm` must be above zero, one for each transmitter")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteKnowledge:
+    """What is known of mirrors besides.
+
+    Attributes
+    ----------
+    receiver_mirror_m : (mirror, receiver, xyz)
+        From the pivot, in the mirror frame [m].
+    pivot_enu_m : (mirror, xyz)
+        Surveyed [m].
+    pivot_sigma_m
+        In each axis [m].
+    commanded_rot : (mirror, 3, 3)
+        Orientation that control commanded, to ENU from the mirror frame; NaN: unknown.
+    posture_sigma_rad
+        How far orientations are from that, about each axis [rad]; infinity: it is where to begin, and no more.
+    roll_sigma_rad
+        How well a mount holds the x axis horizontal [rad]; infinity: no such mount.
+    clock_sigma_m
+        Of each receiver's delay about the mirror's common clock [m].
+    unit_field : (mirror, transmitter)
+        Strength of each transmitter's direct field at the pivot, in units of the voltages: what the floor is relative
+        to.
+    """
+
+    receiver_mirror_m: FloatArray
+    pivot_enu_m: FloatArray
+    pivot_sigma_m: float
+    commanded_rot: FloatArray
+    posture_sigma_rad: float
+    roll_sigma_rad: float
+    clock_sigma_m: float
+    unit_field: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Voltages:
+    """Rays of mirrors in a pose, as the mirrors' antennas receive them.
+
+    Attributes
+    ----------
+    rays
+    voltage : (ray,)
+        Complex, the propagation phase of the path taken off.
+    slope : (ray, xyz)
+        Its derivative by a turn of the mirror about east, north and up [1/rad].
+    reference_rot : (mirror, 3, 3)
+        The orientation they hold for.
+    """
+
+    rays: Rays
+    voltage: ComplexArray
+    slope: ComplexArray
+    reference_rot: FloatArray
+
+
+_FACTOR_SIGMA: dict[RayKind, tuple[float, float]] = {
+    RayKind.DIRECT: (0.0, 0.0),
+    RayKind.GROUND: (0.3, 0.3),
+    RayKind.SPECULAR: (0.1, 0.3),
+    RayKind.DIFFRACTED: (0.1, 0.3),
+    RayKind.OWN_PLATE: (0.1, 0.3),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteSettings:
+    """How poses are fitted.
+
+    Attributes
+    ----------
+    floor
+        Strength of the field that nothing foresees, relative to the direct one; None: found from residuals.
+    least_floor
+        Residuals do not make it smaller than this.
+    tail
+        Degrees of freedom ν of Student's t: the smaller, the less a link counts that is far off.
+    own_scale
+        How many degrees of freedom the mirrors' common floor counts against each mirror's own residuals; infinity: all
+        mirrors alike.
+    factor_sigma
+        By `RayKind`: standard deviation of foreseen rays' factors, relative amplitude and phase [rad].
+    missed_detection
+        Risk at which protection levels are exceeded.
+    rounds
+        How often rays are foreseen anew from the poses found.
+    """
+
+    floor: float | None = None
+    least_floor: float = 1e-3
+    tail: float = 3.0
+    own_scale: float = 8.0
+    factor_sigma: dict[RayKind, tuple[float, float]] = field(default_factory=lambda: dict(_FACTOR_SIGMA))
+    missed_detection: float = 1e-3
+    rounds: int = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SitePoses:
+    """Poses of mirrors; NaN where ``status`` says why.
+
+    Attributes
+    ----------
+    pivot_enu_m, rot_enu_from_mirror : (mirror, xyz), (mirror, 3, 3)
+        [m].
+    cov : (mirror, 6, 6)
+        Of pivot [m] and turn about east, north, up [rad], in this order.
+    weight : (mirror, receiver, transmitter)
+        What each link counts beside one without surprises, 0 to 1.3; NaN: not used.
+    residual_rad, sigma_rad : (mirror, receiver, transmitter)
+        Phase that neither pose nor foreseen rays explain, and its expected standard deviation.
+    floor : (mirror,)
+        Of each mirror, relative to the direct field.
+    dof : (mirror,)
+        What remains of the measurements after all that was fitted.
+    protection_level_rad : (mirror,)
+        The normal is off by more than this at the stated risk.
+    status : (mirror,)
+        `PoseStatus`.
+    common_floor
+        Of all mirrors.
+    """
+
+    pivot_enu_m: FloatArray
+    rot_enu_from_mirror: FloatArray
+    cov: FloatArray
+    weight: FloatArray
+    residual_rad: FloatArray
+    sigma_rad: FloatArray
+    floor: FloatArray
+    dof: FloatArray
+    protection_level_rad: FloatArray
+    status: IntArray
+    common_floor: float
+
+    @property
+    def normal_enu(self) -> FloatArray:
+        """(mirror, xyz) unit normals."""
+        return np.asarray(self.rot_enu_from_mirror[:, :, 2])
+
+    @property
+    def normal_cov(self) -> FloatArray:
+        """(mirror, 3, 3) covariance of the normals [rad²]."""
+        cross = _cross(self.normal_enu)
+        return np.asarray(cross @ self.cov[:, 3:, 3:] @ cross.swapaxes(1, 2))
+
+
+FieldAt = Callable[[FloatArray, FloatArray], Voltages]
+"""From pivots (mirror, xyz) and orientations (mirror, 3, 3) to what the antennas would receive there."""
+
+
+def fit_site(
+    observations: SiteObservations, knowledge: SiteKnowledge, field_at: FieldAt, settings: SiteSettings | None = None
+) -> SitePoses:
+    """Fit the poses of mirrors.
+
+    Parameters
+    ----------
+    observations, knowledge
+    field_at
+        Called with the mirrors' poses; NaN poses may be answered with no rays.
+    settings
+
+    Returns
+    -------
+    SitePoses
+
+    Raises
+    ------
+    InvalidInputError
+        Arrays that do not fit each other.
+    """
+    chosen = settings or SiteSettings()
+    fit = _Fit(observations, knowledge, chosen)
+    known = np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
+    state = _State.begin(knowledge)
+    floor = 0.05 if chosen.floor is None else chosen.floor
+    for _ in range(chosen.rounds):
+        voltages = field_at(state.pivot, state.rot)
+        if chosen.floor is None:
+            floor = fit.common_floor(voltages, state, known, floor)
+        state = fit.run(voltages, state, np.flatnonzero(known), floor)
+    state = _of_all_starts(fit, field_at, state, known, floor)
+    return fit.outcome(state, known, floor)
+
+
+def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float) -> FloatArray:
+    """Return turns (start, xyz) from which to begin so that one is within a sixth of a wavelength of the truth.
+
+    The first is no turn at all. Starts reach 2.5 posture sigmas; none are added where a sixth of the wavelength at the
+    lever is farther than that.
+
+    Parameters
+    ----------
+    posture_sigma_rad
+        Of the commanded posture about each axis [rad].
+    lever_m
+        Of the receivers about the pivot [m].
+    wavelength_m
+        Of the carrier [m].
+    """
+    reach = 2.5 * posture_sigma_rad if np.isfinite(posture_sigma_rad) else 0.0
+    step = wavelength_m / 3.0 / lever_m
+    n = min(int(np.ceil(max(reach / step - 0.5, 0.0))), 3)
+    axis = step * np.arange(-n, n + 1)
+    east, north, up = (g.ravel() for g in np.meshgrid(axis, axis, axis, indexing="ij"))
+    turns = np.stack([east, north, up], axis=1)
+    turns = turns[np.linalg.norm(turns, axis=1) <= max(reach, 1e-12) + 0.5 * step]
+    return np.asarray(turns[np.argsort(np.linalg.norm(turns, axis=1), kind="stable")])
+
+
+@dataclass(slots=True)
+class _State:
+    """Where the fit of each mirror stands."""
+
+    pivot: FloatArray
+    rot: FloatArray
+    cov: FloatArray
+    weight: FloatArray
+    residual: FloatArray
+    sigma: FloatArray
+    scale: FloatArray
+    total: FloatArray
+    dof: FloatArray
+    cost: FloatArray
+    steps: IntArray
+    ambiguous: BoolArray
+    shape: tuple[int, int, int] = (0, 0, 0)
+
+    @classmethod
+    def begin(cls, known: SiteKnowledge) -> _State:
+        n, n_rx = known.receiver_mirror_m.shape[:2]
+        shape = (n, n_rx, known.unit_field.shape[1])
+        return cls.empty(shape, known.pivot_enu_m.copy(), known.commanded_rot.copy())
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int, int], pivot: FloatArray, rot: FloatArray) -> _State:
+        n = shape[0]
+
+        def row() -> FloatArray:
+            return np.full(n, np.nan)
+
+        def link() -> FloatArray:
+            return np.full(shape, np.nan)
+
+        return cls(
+            pivot=pivot, rot=rot, cov=np.full((n, 6, 6), np.nan), weight=link(), residual=link(), sigma=link(),
+            scale=np.ones(n), total=row(), dof=row(), cost=row(), steps=np.full(n, -1, np.int64),
+            ambiguous=np.zeros(n, np.bool_), shape=shape,
+        )  # fmt: skip
+
+
+class _Fit:
+    """The kernel with everything that does not change from call to call."""
+
+    def __init__(self, observations: SiteObservations, knowledge: SiteKnowledge, settings: SiteSettings) -> None:
+        n, n_rx, n_tx = observations.carrier.shape
+        if knowledge.receiver_mirror_m.shape != (n, n_rx, 3) or knowledge.unit_field.shape != (n, n_tx):
+            raise InvalidInputError("`observations` and `knowledge` are not of the same mirrors, receivers, transmitters")
+        self.seen, self.known, self.settings = observations, knowledge, settings
+
+    def run(self, voltages: Voltages, state: _State, rows: IntArray, floor: float) -> _State:
+        """Fit some mirrors from where they stand; the others stay."""
+        seen, known, chosen, rays = self.seen, self.known, self.settings, voltages.rays
+        out = replace(state)
+        fresh = _State.empty(state.shape, state.pivot.copy(), state.rot.copy())
+        order, group, amplitude, phase, link_of = _grouped(rays, seen.carrier.shape, chosen.factor_sigma)
+        with np.errstate(divide="ignore"):
+            info = [np.float64(s) ** -2.0 for s in (known.pivot_sigma_m, known.posture_sigma_rad, known.roll_sigma_rad)]
+            clock_info = np.float64(known.clock_sigma_m) ** -2.0
+        _kernels.fit_mirrors(
+            len(rows), rows, seen.carrier, seen.sigma, seen.wavenumber_radpm, known.unit_field, rays.first, link_of,
+            rays.source_enu_m, rays.place_mirror_m, rays.extra_m, voltages.voltage, voltages.slope, order, group,
+            amplitude, phase, voltages.reference_rot, state.pivot, state.rot, known.pivot_enu_m, float(info[0]),
+            known.commanded_rot, float(info[1]), float(info[2]), float(clock_info), floor, chosen.tail,
+            0.0 if np.isinf(chosen.own_scale) else chosen.own_scale, _MAX_STEPS,
+            fresh.pivot, fresh.rot, fresh.cov, fresh.weight, fresh.residual, fresh.sigma, fresh.scale, fresh.total,
+            fresh.dof, fresh.cost, fresh.steps,
+        )  # fmt: skip
+        for name in ("pivot", "rot", "cov", "weight", "residual", "sigma", "scale", "total", "dof", "cost", "steps"):
+            values = getattr(state, name).copy()
+            values[rows] = getattr(fresh, name)[rows]
+            setattr(out, name, values)
+        return out
+
+    def common_floor(self, voltages: Voltages, state: _State, known: BoolArray, floor: float) -> float:
+        """Return the floor that all mirrors' residuals ask for (restricted maximum likelihood)."""
+        rows = np.flatnonzero(known)
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _FLOOR_MIRRORS).astype(np.int64))] if len(rows) else rows
+        for _ in range(_FLOOR_ROUNDS):
+            state = self.run(voltages, state, rows, floor)
+            total, dof = state.total[rows], state.dof[rows]
+            told = np.isfinite(total) & (dof > 0.0)
+            if not told.any():
+                return floor
+            new = max(floor * float(np.sqrt(total[told].sum() / dof[told].sum())), self.settings.least_floor)
+            settled = abs(np.log(new / floor)) < _FLOOR_SETTLED
+            floor = new
+            if settled:
+                break
+        return floor
+
+    def outcome(self, state: _State, known: BoolArray, floor: float) -> SitePoses:
+        """Return what was found, with reasons where nothing was."""
+        nu = self.settings.tail
+        cov = state.cov * (nu + 3.0) / (nu + 1.0)  # expected information of Student's t, Lange et al. section 4
+        order = [3, 4, 5, 0, 1, 2]
+        cov = cov[:, order][:, :, order]
+        status = np.full(len(known), PoseStatus.OK, np.int64)
+        poses = SitePoses(
+            pivot_enu_m=state.pivot, rot_enu_from_mirror=state.rot, cov=cov, weight=state.weight,
+            residual_rad=state.residual, sigma_rad=state.sigma, floor=floor * np.sqrt(state.scale), dof=state.dof,
+            protection_level_rad=np.full(len(known), np.nan), status=status, common_floor=floor,
+        )  # fmt: skip
+        normal_cov = poses.normal_cov
+        sigma = np.sqrt(np.trace(normal_cov, axis1=1, axis2=2))
+        worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(normal_cov))[:, -1])
+        freedom = np.fmax(np.nan_to_num(state.dof), 1.0) + (0.0 if np.isinf(self.settings.own_scale) else self.settings.own_scale)
+        level = worst * np.sqrt(2.0 * fdtri(2.0, freedom, 1.0 - self.settings.missed_detection))
+        status[~(sigma <= MAX_SIGMA_RAD)] = PoseStatus.UNCERTAIN
+        status[state.ambiguous] = PoseStatus.AMBIGUOUS
+        status[state.steps >= _MAX_STEPS] = PoseStatus.NOT_CONVERGED
+        status[_redundancy(state.weight) < _TELLING] = PoseStatus.UNKNOWNS
+        status[state.steps < 0] = PoseStatus.UNKNOWNS
+        status[~known] = PoseStatus.NO_POSTURE
+        lost = np.isin(status, (PoseStatus.UNKNOWNS, PoseStatus.NO_POSTURE, PoseStatus.NOT_CONVERGED))
+        for values in (poses.pivot_enu_m, poses.rot_enu_from_mirror, poses.cov, poses.floor):
+            values[lost] = np.nan
+        return replace(poses, protection_level_rad=np.where(lost, np.nan, level))
+
+
+def _redundancy(weight: FloatArray) -> IntArray:
+    """(mirror,) links used less one a transmitter and six of the pose."""
+    used = np.isfinite(weight)
+    return np.asarray(used.sum(axis=(1, 2)) - used.any(axis=1).sum(axis=1) - 6)
+
+
+def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray, floor: float) -> _State:
+    """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
+    knowledge = fit.known
+    lever = float(np.nanmax(np.linalg.norm(knowledge.receiver_mirror_m, axis=-1), initial=0.0))
+    wavelength = 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
+    turns = spread_starts(knowledge.posture_sigma_rad, max(lever, 1e-9), wavelength)[1:]
+    rows = np.flatnonzero(known & (state.steps > 0))
+    if not len(turns) or not len(rows):
+        return state
+    apart = 0.5 * wavelength / lever / 3.0
+    near = field_at(knowledge.pivot_enu_m, knowledge.commanded_rot)
+    for w in turns:
+        turned = np.empty((3, 3))
+        _kernels.turn(w, turned)
+        start = replace(state, pivot=knowledge.pivot_enu_m.copy(), rot=turned @ knowledge.commanded_rot)
+        found = fit.run(near, start, rows, floor)
+        off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
+        ended = (found.steps > 0) & (found.steps < _MAX_STEPS)
+        other = ended & (off > apart)
+        better = other & (found.cost < state.cost)
+        gap = np.abs(found.cost - state.cost)
+        state.ambiguous = np.where(better, gap < _AMBIGUOUS_COST, state.ambiguous | (other & (gap < _AMBIGUOUS_COST)))
+        if better.any():
+            for name in ("pivot", "rot"):
+                values = getattr(state, name).copy()
+                values[better] = getattr(found, name)[better]
+                setattr(state, name, values)
+            again = np.flatnonzero(better)
+            ambiguous = state.ambiguous
+            state = fit.run(field_at(state.pivot, state.rot), state, again, floor)
+            state.ambiguous = ambiguous
+    return state
+
+
+def _grouped(
+    rays: Rays, shape: tuple[int, ...], factor_sigma: dict[RayKind, tuple[float, float]]
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]:
+    """Put rays that share their factor's error beside each other, mirror by mirror.
+
+    Returns
+    -------
+    order : (ray,)
+        Rays by mirror and group.
+    group : (ray,)
+        −1: no error; else equal for rays of one mirror that share it.
+    amplitude, phase : (ray,)
+        Of the factor.
+    link_of : (ray,)
+        Within the mirror.
+    """
+    n_link = shape[1] * shape[2]
+    link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+    mirror, link_of = np.divmod(link, n_link)
+    transmitter = link_of % shape[2]
+    sigma = np.array([factor_sigma.get(kind, (0.0, 0.0)) for kind in RayKind])
+    amplitude, phase = sigma[rays.kind].T
+    shared = np.where(rays.kind == RayKind.GROUND, 0, transmitter)
+    thing = np.where(rays.kind == RayKind.GROUND, -1, rays.thing)
+    key = np.stack([rays.kind, thing, shared], axis=1)
+    group = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1) if len(key) else np.zeros(0, np.int64)
+    group = np.where((amplitude > 0.0) | (phase > 0.0), group, -1)
+    order = np.lexsort((group, mirror))
+    return order, group, np.ascontiguousarray(amplitude), np.ascontiguousarray(phase), link_of
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return out - out.swapaxes(1, 2)
