@@ -1,0 +1,499 @@
+"""Kernels of rays: what hides a way, where planes and edges turn it, and what they make of the electric field.
+
+Points and directions are tuples (x, y, z), fields tuples of complex components in the same frame; time goes as
+e^{+jωt}. A wave that went the length L carries the factor e^{-jkL}, which is kept out of all fields here.
+
+Reflection at a plane of normal n and relative permittivity ε, s = sine of the grazing angle, q = √(ε − 1 + s²):
+
+    across the plane of incidence  (s − q) / (s + q),      in it  (ε s − q) / (ε s + q),
+
+the latter's sign kept by the component along n. Metal (ε given as zero): −1 and +1.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.jit import kernel, kernel_rows
+
+Float64 = npt.NDArray[np.float64]
+Complex128 = npt.NDArray[np.complex128]
+Int64 = npt.NDArray[np.int64]
+
+DIRECT, GROUND, SPECULAR, DIFFRACTED, OWN_PLATE = 0, 1, 2, 3, 4
+NOTHING = -1
+NO_FACE = -1
+THE_GROUND = 0  # its number among the faces
+
+
+class Scene(NamedTuple):
+    """What stands on the site.
+
+    Plates come first among the things, then boxes, then the ground; among the faces the ground is first, then one for
+    each plate, then six for each box. ``permittivity`` (thing, transmitter) is zero for metal.
+    """
+
+    transmitter: Float64
+    wavenumber: Float64
+    dipole: bool
+    # plates, by cells of side `cell`: member[start[i, j]:start[i, j + 1]] stand in cell (i, j)
+    centre: Float64
+    rot: Float64
+    half: Float64
+    reach: float
+    top: float
+    x0: float
+    y0: float
+    cell: float
+    start: Int64
+    member: Int64
+    # boxes
+    box_centre: Float64
+    box_rot: Float64
+    box_half: Float64
+    # faces: (face, 3), (face, 3, 3) with the normal in the last column, (face, 2)
+    face_point: Float64
+    face_rot: Float64
+    face_half: Float64
+    face_thing: Int64
+    two_sided: Int64
+    permittivity: Complex128
+
+
+class Wanted(NamedTuple):
+    """Which rays to look for."""
+
+    hide: bool
+    ground: bool
+    specular: bool
+    own_plate: bool
+    faint: float
+
+
+class Receivers(NamedTuple):
+    """Mirrors and where their receivers are; ``near`` (pair,) are plates to look at, by mirror from ``near_start``."""
+
+    pivot: Float64
+    rot: Float64
+    place: Float64
+    own: Int64
+    near_start: Int64
+    near: Int64
+
+
+class Found(NamedTuple):
+    """Rays by link (mirror, receiver, transmitter, ray); ``n_ray`` may exceed the room there is."""
+
+    n_ray: Int64
+    source: Float64
+    place: Float64
+    extra: Float64
+    field: Complex128
+    kind: npt.NDArray[np.int8]
+    thing: npt.NDArray[np.int32]
+
+
+# -- vectors -----------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def at(array, i):
+    """Row of an array as a tuple."""
+    return array[i, 0], array[i, 1], array[i, 2]
+
+
+@kernel
+def dot(a, b):
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
+def cross(a, b):
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def minus(a, b):
+    """``a − b``."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@kernel
+def along(a, f, d):
+    """``a + f d``."""
+    return a[0] + f * d[0], a[1] + f * d[1], a[2] + f * d[2]
+
+
+@kernel
+def times(f, a):
+    """``f a``."""
+    return f * a[0], f * a[1], f * a[2]
+
+
+@kernel
+def length(a):
+    """Length of a real vector."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@kernel
+def size(field):
+    """Length of a complex vector."""
+    return math.sqrt(abs(field[0]) ** 2 + abs(field[1]) ** 2 + abs(field[2]) ** 2)
+
+
+@kernel
+def towards(a, b):
+    """Unit vector from a to b."""
+    d = minus(b, a)
+    return times(1.0 / length(d), d)
+
+
+@kernel
+def axis(rot, i, column):
+    """Column of a rotation."""
+    return rot[i, 0, column], rot[i, 1, column], rot[i, 2, column]
+
+
+# -- what hides --------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def plate_hides(scene, p, a, b):
+    """Whether the way from a to b crosses a plate."""
+    centre = at(scene.centre, p)
+    normal = axis(scene.rot, p, 2)
+    da, db = dot(minus(a, centre), normal), dot(minus(b, centre), normal)
+    if da * db >= 0.0:
+        return False
+    d = minus(along(a, da / (da - db), minus(b, a)), centre)
+    return (
+        abs(dot(d, axis(scene.rot, p, 0))) < scene.half[p, 0] and abs(dot(d, axis(scene.rot, p, 1))) < scene.half[p, 1]
+    )
+
+
+@kernel
+def box_hides(scene, i, a, b):
+    """Whether the way from a to b goes through a box."""
+    low, high = 0.0, 1.0
+    centre = at(scene.box_centre, i)
+    to_a, way = minus(a, centre), minus(b, a)
+    for k in range(3):
+        side = axis(scene.box_rot, i, k)
+        o, d, half = dot(to_a, side), dot(way, side), scene.box_half[i, k]
+        if abs(d) < 1e-12:
+            if abs(o) >= half:
+                return False
+            continue
+        first, second = (-half - o) / d, (half - o) / d
+        low, high = max(low, min(first, second)), min(high, max(first, second))
+    return low < high
+
+
+@kernel
+def plates_hide(scene, a, b, skip, skip_too):
+    """Whether any plate but two stands in the way; walks along the ray through the cells."""
+    if a[2] > b[2]:
+        a, b = b, a
+    n_column, n_row = scene.start.shape[0], scene.start.shape[1] - 1
+    d = minus(b, a)
+    flat, square = math.sqrt(d[0] * d[0] + d[1] * d[1]), dot(d, d)
+    end = 1.0
+    if d[2] > 0.0:  # above the highest edge of any plate nothing is in the way
+        end = min(1.0, (scene.top - a[2]) / d[2])
+    if end <= 0.0:
+        return False
+    n_step = int(end * flat / scene.cell) + 1
+    last_i, last_j = -9, -9
+    for k in range(n_step + 1):
+        f = end * k / n_step
+        i = math.floor((a[0] + f * d[0] - scene.x0) / scene.cell)
+        j = math.floor((a[1] + f * d[1] - scene.y0) / scene.cell)
+        if i == last_i and j == last_j:
+            continue
+        last_i, last_j = i, j
+        for column in range(max(0, i - 1), min(n_column, i + 2)):
+            first, behind = max(0, j - 1), min(n_row, j + 2)
+            if first >= behind:
+                continue
+            for q in range(scene.start[column, first], scene.start[column, behind]):
+                p = scene.member[q]
+                if p in (skip, skip_too):
+                    continue
+                # distance of the plate's centre from the ray, before its exact outline
+                c = minus(at(scene.centre, p), a)
+                t = min(1.0, max(0.0, dot(c, d) / square))
+                g = along(c, -t, d)
+                if dot(g, g) <= scene.reach * scene.reach and plate_hides(scene, p, a, b):
+                    return True
+    return False
+
+
+@kernel
+def free(scene, wanted, a, b, skip, skip_too):
+    """Whether nothing but two things, which touch the way's ends, hides b from a."""
+    if not wanted.hide:
+        return True
+    n_plate = scene.centre.shape[0]
+    for i in range(scene.box_centre.shape[0]):
+        if n_plate + i != skip and n_plate + i != skip_too and box_hides(scene, i, a, b):
+            return False
+    return n_plate == 0 or not plates_hide(scene, a, b, skip, skip_too)
+
+
+# -- planes ------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def height(scene, f, a):
+    """Distance of a point from a face's plane, along its normal."""
+    return dot(minus(a, at(scene.face_point, f)), axis(scene.face_rot, f, 2))
+
+
+@kernel
+def mirrored(scene, f, a):
+    """Mirror image of a point in a face's plane."""
+    return along(a, -2.0 * height(scene, f, a), axis(scene.face_rot, f, 2))
+
+
+@kernel
+def meets(scene, f, image, a):
+    """Whether a ray that seems to come from an image comes off face f to a, and where it touches it."""
+    far, near = height(scene, f, image), height(scene, f, a)
+    if far * near >= 0.0 or (near < 0.0 and scene.two_sided[f] == 0):
+        return False, a
+    point = along(a, near / (near - far), minus(image, a))
+    d = minus(point, at(scene.face_point, f))
+    inside = (
+        abs(dot(d, axis(scene.face_rot, f, 0))) < scene.face_half[f, 0]
+        and abs(dot(d, axis(scene.face_rot, f, 1))) < scene.face_half[f, 1]
+    )
+    return inside, point
+
+
+@kernel
+def launched(scene, direction):
+    """Field that the transmitter's antenna sends in a direction, at the unit of distance."""
+    flat = math.sqrt(direction[0] * direction[0] + direction[1] * direction[1])
+    if flat < 1e-9:  # straight up or down no direction is the vertical one's
+        gain = 0.0 if scene.dipole else 1.0
+        return gain + 0j, 0j, 0j
+    gain = 1.0 + 0j
+    if scene.dipole:
+        gain = 1.2818 * math.cos(0.5 * math.pi * direction[2]) / flat + 0j
+    return gain * direction[2] * direction[0] / flat, gain * direction[2] * direction[1] / flat, -gain * flat
+
+
+@kernel
+def fresnel(permittivity, s):
+    """Coefficients of a plane across the plane of incidence and in it; s is the sine of the grazing angle."""
+    if permittivity == 0.0:
+        return -1.0 + 0j, 1.0 + 0j
+    q = np.sqrt(permittivity - 1.0 + s * s)
+    return (s - q) / (s + q), (permittivity * s - q) / (permittivity * s + q)
+
+
+@kernel
+def bounced(scene, t, f, direction, field):
+    """Field after reflection at a face of a wave that travels along a direction."""
+    normal = axis(scene.face_rot, f, 2)
+    c = dot(direction, normal)
+    across, within = fresnel(scene.permittivity[scene.face_thing[f], t], abs(c))
+    side = cross(direction, normal)
+    flat = length(side)
+    if flat < 1e-9:
+        return times(across, field)
+    side = times(1.0 / flat, side)
+    before, after = cross(side, direction), cross(side, along(direction, -2.0 * c, normal))
+    s, p = across * dot(field, side), within * dot(field, before)
+    return s * side[0] + p * after[0], s * side[1] + p * after[1], s * side[2] + p * after[2]
+
+
+@kernel
+def reflected(scene, wanted, t, first, second, a, weak):
+    """Whether transmitter t's ray off a face, or off two of them in order, reaches a; the field that it brings.
+
+    ``second`` may be `NO_FACE`. Rays weaker than ``weak`` do not count.
+    """
+    origin = at(scene.transmitter, t)
+    nothing = (0j, 0j, 0j)
+    image = mirrored(scene, first, origin)
+    thing, thing_too = scene.face_thing[first], NOTHING
+    q = a
+    if second != NO_FACE:
+        ok, q = meets(scene, second, mirrored(scene, second, image), a)
+        if not ok:
+            return False, nothing
+        thing_too = scene.face_thing[second]
+    ok, p = meets(scene, first, image, q)
+    if not ok:
+        return False, nothing
+    way = length(minus(p, origin)) + length(minus(q, p)) + length(minus(a, q))
+    direction = towards(origin, p)
+    field = bounced(scene, t, first, direction, launched(scene, direction))
+    if second != NO_FACE:
+        field = bounced(scene, t, second, towards(p, q), field)
+    field = times(1.0 / way, field)
+    if size(field) < weak:
+        return False, nothing
+    ok = free(scene, wanted, origin, p, thing, NOTHING)
+    if second == NO_FACE:
+        return ok and free(scene, wanted, p, a, thing, NOTHING), field
+    ok = ok and free(scene, wanted, p, q, thing, thing_too) and free(scene, wanted, q, a, thing_too, NOTHING)
+    return ok, field
+
+
+@kernel
+def in_beam(scene, f, image, a, spread):
+    """Whether the line from an image to a passes face f within its half diagonal and ``spread``: no ray else."""
+    d = minus(a, image)
+    c = minus(at(scene.face_point, f), image)
+    g = along(c, -dot(c, d) / dot(d, d), d)
+    reach = math.sqrt(scene.face_half[f, 0] ** 2 + scene.face_half[f, 1] ** 2) + spread
+    return dot(g, g) <= reach * reach
+
+
+# -- links -------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def put(found, m, r, t, source, place, extra, field, kind, thing):
+    """Write a ray down, where there is room."""
+    k = found.n_ray[m, r, t]
+    found.n_ray[m, r, t] = k + 1
+    if k >= found.extra.shape[3]:
+        return
+    for i in range(3):
+        found.source[m, r, t, k, i] = source[i]
+        found.place[m, r, t, k, i] = place[i]
+        found.field[m, r, t, k, i] = field[i]
+    found.extra[m, r, t, k] = extra
+    found.kind[m, r, t, k] = kind
+    found.thing[m, r, t, k] = thing
+
+
+@kernel
+def in_mirror(receivers, m, a):
+    """Point in the mirror's frame, from the pivot."""
+    d = minus(a, at(receivers.pivot, m))
+    rot = receivers.rot
+    return dot(d, axis(rot, m, 0)), dot(d, axis(rot, m, 1)), dot(d, axis(rot, m, 2))
+
+
+@kernel
+def receiver_at(receivers, m, r):
+    """Receiver's place on the site."""
+    a = at(receivers.pivot, m)
+    for k in range(3):
+        a = along(a, receivers.place[m, r, k], axis(receivers.rot, m, k))
+    return a
+
+
+@kernel
+def off_face(scene, wanted, receivers, found, m, t, f, middle, spread):
+    """Add the rays off a face, those that the ground turned before, and those that it turns after."""
+    origin = at(scene.transmitter, t)
+    image = mirrored(scene, f, origin)
+    alone = in_beam(scene, f, image, middle, spread)
+    before = wanted.ground and in_beam(
+        scene, f, mirrored(scene, f, mirrored(scene, THE_GROUND, origin)), middle, spread
+    )
+    after = wanted.ground and in_beam(scene, f, image, mirrored(scene, THE_GROUND, middle), spread)
+    if not (alone or before or after):
+        return
+    thing = scene.face_thing[f]
+    for r in range(receivers.place.shape[1]):
+        a, place = receiver_at(receivers, m, r), at(receivers.place[m], r)
+        if math.isnan(a[0]):
+            continue
+        weak = wanted.faint / length(minus(a, origin))
+        for first, second, maybe in ((f, NO_FACE, alone), (THE_GROUND, f, before), (f, THE_GROUND, after)):
+            if not maybe:
+                continue
+            ok, field = reflected(scene, wanted, t, first, second, a, weak)
+            if ok:
+                source = mirrored(scene, first, origin)
+                if second != NO_FACE:
+                    source = mirrored(scene, second, source)
+                put(found, m, r, t, source, place, 0.0, field, SPECULAR, thing)
+
+
+@kernel
+def off_own_plate(scene, wanted, receivers, found, m, t, first, middle, spread):
+    """Add the rays that the mirror's own plate turns last, ``first`` being what turned them before."""
+    own = 1 + receivers.own[m]
+    origin = at(scene.transmitter, t)
+    source = origin
+    if first != NO_FACE:
+        source = mirrored(scene, first, origin)
+        if first != THE_GROUND and not in_beam(scene, first, source, mirrored(scene, own, middle), spread):
+            return
+    for r in range(receivers.place.shape[1]):
+        a = receiver_at(receivers, m, r)
+        if math.isnan(a[0]):
+            continue
+        weak = wanted.faint / length(minus(a, origin))
+        if first == NO_FACE:
+            ok, field = reflected(scene, wanted, t, own, NO_FACE, a, weak)
+        else:
+            ok, field = reflected(scene, wanted, t, first, own, a, weak)
+        if ok:
+            # the receiver's image in the plate turns with the mirror, as the receiver does
+            image = in_mirror(receivers, m, mirrored(scene, own, a))
+            put(found, m, r, t, source, image, 0.0, field, OWN_PLATE, scene.face_thing[own])
+
+
+@kernel
+def unturned(scene, wanted, receivers, found, m, t):
+    """Add direct rays and those off the ground."""
+    origin = at(scene.transmitter, t)
+    ground = scene.face_thing[THE_GROUND]
+    for r in range(receivers.place.shape[1]):
+        a, place = receiver_at(receivers, m, r), at(receivers.place[m], r)
+        if math.isnan(a[0]):
+            continue
+        if free(scene, wanted, origin, a, NOTHING, NOTHING):
+            field = times(1.0 / length(minus(a, origin)), launched(scene, towards(origin, a)))
+            put(found, m, r, t, origin, place, 0.0, field, DIRECT, NOTHING)
+        if wanted.ground:
+            ok, field = reflected(scene, wanted, t, THE_GROUND, NO_FACE, a, 0.0)
+            if ok:
+                put(found, m, r, t, mirrored(scene, THE_GROUND, origin), place, 0.0, field, GROUND, ground)
+
+
+@kernel_rows
+def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found):
+    """Find the rays of mirrors; ``middle`` (mirror, xyz) and ``spread`` (mirror,) are spheres about their receivers."""
+    n_plate, n_box = scene.centre.shape[0], scene.box_centre.shape[0]
+    first_of_boxes, behind = 1 + n_plate, 1 + n_plate + 6 * n_box
+    for m in range(begin, end):
+        found.n_ray[m] = 0
+        here = at(middle, m)
+        if math.isnan(here[0]):
+            continue
+        own = receivers.own[m]
+        near = receivers.near[receivers.near_start[m] : receivers.near_start[m + 1]]
+        for t in range(scene.transmitter.shape[0]):
+            unturned(scene, wanted, receivers, found, m, t)
+            if wanted.specular:
+                for p in near:
+                    if p != own:
+                        off_face(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
+                for f in range(first_of_boxes, behind):
+                    off_face(scene, wanted, receivers, found, m, t, f, here, spread[m])
+            if wanted.own_plate and own >= 0:
+                off_own_plate(scene, wanted, receivers, found, m, t, NO_FACE, here, spread[m])
+                if wanted.ground:
+                    off_own_plate(scene, wanted, receivers, found, m, t, THE_GROUND, here, spread[m])
+                if wanted.specular:
+                    for p in near:
+                        if p != own:
+                            off_own_plate(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
+                    for f in range(first_of_boxes, behind):
+                        off_own_plate(scene, wanted, receivers, found, m, t, f, here, spread[m])
