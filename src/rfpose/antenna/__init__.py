@@ -1,0 +1,7 @@
+"""What an antenna on a mirror makes of a wave: tables of its response, looked up with their slope, and learned."""
+
+from rfpose.antenna.pattern import AntennaPattern, dipole_pattern
+from rfpose.antenna.sphere import cartesian, components, grid_directions
+from rfpose.antenna.table import PatternTable
+
+__all__ = ["AntennaPattern", "PatternTable", "cartesian", "components", "dipole_pattern", "grid_directions"]
