@@ -104,7 +104,7 @@ def table_of(vector: ComplexArray, sigma: FloatArray, axis_mirror: FloatArray) -
     axis_mirror : (receiver, xyz)
         Of that dipole.
     """
-    unknown: npt.NDArray[np.bool_] = np.isnan(vector).any(axis=-1)
+    unknown = np.asarray(np.isnan(vector).any(axis=-1))
     gaps = bool(unknown.any())
     if gaps:
         vector = np.where(unknown[..., None], _dipoles(axis_mirror, *vector.shape[1:3]), vector)
