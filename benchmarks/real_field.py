@@ -1,0 +1,463 @@
+"""Print what becomes of poses in a real field: ground, neighbours, tower, the plate behind the antennas.
+
+    python benchmarks/real_field.py ../shared/data/traced                  # the whole table
+    python benchmarks/real_field.py ../shared/data/traced --pose rigid     # without the site in the model
+    python benchmarks/real_field.py ../shared/data/traced --case 'beside' --json
+
+Propagation is by programs that this project did not write: ray tables by Sionna RT and a receiver's own mirror by NEC-2
+(see `benchmarks/traced.py`). Tones of 0.75 and 7.5 MHz, 50 dB; eight mirrors and two suns, so sixteen mirror-frames a
+case; pivots as surveyed are 5 mm off, with that sigma; commanded postures 20 mrad off. Errors are of the mirror normal
+in mrad; NEES is the mean squared error over the stated covariance, 1 where that is true. Silent: solved, and the error
+above its protection level or above 5 sigma. Tables of one's own (`scripts/trace_sionna.py`) and antenna patterns are
+looked for in the folders of ``--tables`` and ``--patterns``; cases that lack theirs are named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import traced
+from traced import SPEED_MPS, Table, antenna_isotropic, lines_of, measured, site_of
+
+from rfpose import geometry
+from rfpose.dsp import TonePhases
+from rfpose.errors import RfposeError
+from rfpose.multilat import PoseStatus
+from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.solve import solve
+from rfpose.scenario import Scenario
+
+__all__ = ["Case", "Folders", "cases"]
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+SUNS = (0, 1)
+COMMANDED_OFF_RAD = 0.02
+PIVOT_OFF_M = 0.005
+SEED = 1
+RIM = r"D:ground"
+"""The ground of the ray tracer ends; rays from its rim are no physics."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Folders:
+    """Where tables are: the given ones, one's own, and antenna patterns."""
+
+    given: Path
+    own: Path | None = None
+    patterns: Path | None = None
+
+    def table(self, variant: str, mhz: float, sun: int) -> Table | None:
+        """Return a table, of the given ones first; None where there is none."""
+        for folder in (self.given / "paths", self.own):
+            path = None if folder is None else folder / f"{variant}_{mhz:.0f}MHz_sun{sun}.npz"
+            if path is not None and path.exists():
+                return Table.read(path)
+        return None
+
+    def moments(self, place: str, mhz: float) -> Path | None:
+        """Return the file of responses by moments; None where there is none."""
+        path = self.given / "nec" / f"{place}_y_{mhz:.0f}MHz.npz"
+        return path if path.exists() else None
+
+    def pattern(self, place: str, mhz: float) -> Path | None:
+        """Return the file of an antenna pattern; None where there is none."""
+        path = None if self.patterns is None else self.patterns / f"{place}_y_{mhz:.0f}MHz.npz"
+        return path if path is not None and path.exists() else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spec:
+    """A row of the table: which propagation, what the solver is told of it, and what is wished.
+
+    Attributes
+    ----------
+    variant
+        Of the ray tables; ``moments``: direct rays, by the responses of the receiver's own mirror alone;
+        ``everything``: ground, tower and neighbours, diffraction at their edges, and the antenna's pattern.
+    drop
+        Rays whose code matches are left out.
+    antenna
+        ``isotropic``, or ``plate``: a dipole before its own plate, by moments.
+    told
+        What the solver is told of the antenna: ``none``, ``given`` or ``learned``.
+    ground
+        Factor on the ground's true constants in what the solver is told; None: that there is no ground.
+    transmitters
+        ``10`` those of Table 2, ``5`` and ``20`` fewer and more, ``high`` all 30 m higher.
+    target_mrad
+        Rms to be reached; None: not stated.
+    today
+        What the solver of before made of it, as measured then.
+    """
+
+    name: str
+    mhz: float = 433.0
+    place: str
+    variant: str
+    drop: str = RIM
+    antenna: str = "isotropic"
+    told: str = "none"
+    ground: float | None = 1.0
+    transmitters: str = "10"
+    target_mrad: float | None = None
+    today: str = ""
+
+
+def _specs() -> Iterator[Spec]:
+    for place, factor in (("beside", 1.0), ("front", 2.0)):
+        yield Spec(
+            name=f"tower, neighbours, no ground; {place}", place=place, variant="field", drop="ground", ground=None,
+            target_mrad=0.15 * factor, today="15/16 at 0.0012 by leaving out",
+        )  # fmt: skip
+        yield Spec(name=f"ground, true constants; {place}", place=place, variant="ground", today="6/8; 0/24")
+        yield Spec(
+            name=f"ground, constants 30 % off; {place}", place=place, variant="ground", ground=1.3,
+            target_mrad=0.5 * factor,
+        )  # fmt: skip
+        yield Spec(
+            name=f"ground, tower, neighbours; {place}", place=place, variant="field", target_mrad=1.3 * factor,
+            today="0/24",
+        )  # fmt: skip
+        yield Spec(name=f"and own plates as rays; {place}", place=place, variant="plates", target_mrad=5.0 * factor)
+        yield Spec(
+            name=f"and plates and edges; {place}", place=place, variant="edges", target_mrad=5.0 * factor,
+            today="0/16; 0/24",
+        )  # fmt: skip
+    for mhz, place in ((100.0, "beside"), (100.0, "front"), (433.0, "front"), (433.0, "beside")):
+        yield Spec(
+            name=f"own plate by moments alone, {mhz:.0f} MHz, pattern given; {place}", mhz=mhz, place=place,
+            variant="moments", antenna="plate", told="given", ground=None, target_mrad=0.05, today="0/16",
+        )  # fmt: skip
+    for mhz, place, targets in (
+        (100.0, "beside", (None, None, None)),
+        (433.0, "beside", (None, 4.6, 6.0)),
+        (433.0, "front", (None, 5.0, 6.5)),
+    ):
+        for told, target in zip(("none", "given", "learned"), targets, strict=True):
+            yield Spec(
+                name=f"everything, {mhz:.0f} MHz, pattern {told}; {place}", mhz=mhz, place=place, variant="everything",
+                antenna="plate", told=told, target_mrad=target, today="0",
+            )  # fmt: skip
+    for transmitters, what, target in (
+        ("5", "5 transmitters", None), ("20", "20 transmitters", 3.6), ("high", "transmitters 30 m higher", None),
+    ):  # fmt: skip
+        yield Spec(
+            name=f"everything, {what}, pattern given; beside", place="beside", variant="everything", antenna="plate",
+            told="given", transmitters=transmitters, target_mrad=target,
+        )  # fmt: skip
+    for mhz in (100.0, 433.0, 2400.0):
+        yield Spec(
+            name=f"isotropic, no own plate, {mhz:.0f} MHz; beside", mhz=mhz, place="beside", variant="everything",
+        )  # fmt: skip
+
+
+# -- cases ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A row of the table as measured, with its truth.
+
+    Attributes
+    ----------
+    spec
+        What it is.
+    scenario
+        The site as the solver is told it: pivots as surveyed, ground's constants as known.
+    tones
+        What was measured, a sun a frame.
+    normal_true_enu, normal_commanded_enu : (frame, heliostat, xyz)
+        Where mirrors point, and where they were told to.
+    neighbour_enu_m : (neighbour, xyz)
+        Centres of the plates that carry no receiver.
+    neighbour_normal_enu : (frame, neighbour, xyz)
+        Their postures.
+    pattern
+        File of the antenna's pattern; None: the solver is told none.
+    """
+
+    spec: Spec
+    scenario: Scenario
+    tones: TonePhases
+    normal_true_enu: Array
+    normal_commanded_enu: Array
+    neighbour_enu_m: Array
+    neighbour_normal_enu: Array
+    pattern: Path | None
+
+    @property
+    def name(self) -> str:
+        """What it is, in words."""
+        return self.spec.name
+
+
+def cases(folder: str | Path, *, own: str | Path | None = None, patterns: str | Path | None = None) -> list[Case]:
+    """Return the cases of the table whose tables are there.
+
+    Parameters
+    ----------
+    folder
+        ``../shared/data/traced``.
+    own, patterns
+        Folders of tables and antenna patterns of one's own.
+    """
+    folders = Folders(
+        given=Path(folder),
+        own=None if own is None else Path(own),
+        patterns=None if patterns is None else Path(patterns),
+    )
+    found = [case_of(spec, folders) for spec in _specs()]
+    return [case for case in found if not isinstance(case, str)]
+
+
+def case_of(spec: Spec, folders: Folders) -> Case | str:
+    """Return a case, or what it lacks."""
+    truth = _true_site(spec)
+    normal = traced.normals_enu(truth, SUNS)
+    lines = []
+    for frame, sun in enumerate(SUNS):
+        found = _lines(spec, folders, truth, sun, geometry.rot_enu_from_mirror(normal[frame]))
+        if isinstance(found, str):
+            return found
+        lines.append(found)
+    pattern = None
+    if spec.told != "none":
+        pattern = folders.pattern(spec.place, spec.mhz)
+        if pattern is None:
+            return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
+    rng = np.random.default_rng([SEED, 2])
+    neighbour = traced.neighbours_enu_m(truth)
+    return Case(
+        spec=spec,
+        scenario=_told_site(spec, truth),
+        tones=measured(truth, np.stack(lines), seed=SEED),
+        normal_true_enu=normal,
+        normal_commanded_enu=_tilted(normal, COMMANDED_OFF_RAD, rng),
+        neighbour_enu_m=neighbour,
+        neighbour_normal_enu=np.stack([traced.tracking_normal_enu(truth, neighbour, sun) for sun in SUNS]),
+        pattern=pattern,
+    )
+
+
+def _true_site(spec: Spec) -> Scenario:
+    place_m = None if spec.transmitters == "10" else traced.TRANSMITTERS_ENU_M[spec.transmitters]
+    return site_of(1e6 * spec.mhz, spec.place, transmitter_enu_m=place_m)
+
+
+def _told_site(spec: Spec, truth: Scenario) -> Scenario:
+    """Return the site as surveyed: pivots off, ground's constants off."""
+    off = PIVOT_OFF_M * np.random.default_rng([SEED, 1]).standard_normal(truth.pivot_enu_m.shape)
+    told = truth.changed(
+        heliostat=[
+            {**h.model_dump(exclude_none=True), "pivot_enu_m": tuple(p)}
+            for h, p in zip(truth.heliostat, (truth.pivot_enu_m + off).tolist(), strict=True)
+        ]
+    )
+    if spec.ground is None:
+        return told
+    permittivity, conductivity = traced.soil(1e6 * spec.mhz)
+    return told.changed(
+        reflection={
+            "model": "fresnel",
+            "permittivity": permittivity * spec.ground,
+            "conductivity_s_per_m": conductivity * spec.ground,
+        }
+    )
+
+
+def _tilted(normal: Array, angle_rad: float, rng: np.random.Generator) -> Array:
+    """Return normals turned by an angle, each to a side of its own."""
+    aside = np.cross(normal, geometry.unit(rng.standard_normal(normal.shape)))
+    return geometry.unit(normal + np.tan(angle_rad) * geometry.unit(aside))
+
+
+def _lines(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -> Complex | str:
+    """Return (receiver, transmitter, line) of one sun, or what is missing."""
+    if spec.variant == "moments":
+        return _lines_by_moments(spec, folders, site, sun, rot)
+    table = _table(spec, folders, sun)
+    if isinstance(table, str):
+        return table
+    table = table.without(spec.drop).at(site, spec.place)
+    if spec.transmitters == "5":
+        table = table.from_transmitters(traced.FIVE)
+    if spec.antenna == "isotropic":
+        return lines_of(site, table, antenna_isotropic(table, rot))
+    pattern = folders.pattern(spec.place, spec.mhz)
+    if pattern is None:
+        return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
+    return f"patterns are not read yet: {pattern}"
+
+
+def _table(spec: Spec, folders: Folders, sun: int) -> Table | str:
+    set_of = {"5": "", "10": ""}.get(spec.transmitters, f"-{spec.transmitters}")
+    if spec.variant != "everything":
+        table = folders.table(spec.variant + set_of, spec.mhz, sun)
+        return f"no table {spec.variant}{set_of}_{spec.mhz:.0f}MHz_sun{sun}" if table is None else table
+    # traced without the plates of the receivers' own mirrors; else put together: rays that they hide are in `field`
+    whole = folders.table("open" + set_of, spec.mhz, sun)
+    if whole is not None:
+        return whole
+    field, edges = (folders.table(name + set_of, spec.mhz, sun) for name in ("field", "edges"))
+    if field is None or edges is None:
+        return f"no table open{set_of}_{spec.mhz:.0f}MHz_sun{sun}, nor field and edges"
+    diffracted = np.array(["D:" in str(code) for code in edges.code])
+    return field.and_rays_of(edges.only(diffracted & ~edges.meets_own_plate()))
+
+
+def _lines_by_moments(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -> Complex | str:
+    """Return the lines of direct rays alone, received before the mirror's own plate."""
+    path = folders.moments(spec.place, spec.mhz)
+    if path is None:
+        return f"no responses {spec.place}_y_{spec.mhz:.0f}MHz"
+    with np.load(path, allow_pickle=False) as file:
+        response, centre_hz = file["response"][:, sun, :, :, :, 0], 1e6 * file["freqs"]
+        response = response / np.linalg.norm(file["free"])
+    rows = [site.receiver_rows(i) for i in range(len(site.heliostat))]
+    receiver = traced.receivers_enu_m(site, rot)
+    ray = site.transmitter_enu_m - receiver[:, None]
+    distance = np.linalg.norm(ray, axis=-1)
+    theta = traced.theta_hat(ray / distance[..., None])
+    rf_hz = site.radio.centre_frequency_hz + site.line_hz
+    weight = traced.quadratic(rf_hz, centre_hz)
+    gain = np.ones((*distance.shape, site.line_hz.shape[1]), np.complex128)
+    for i, slab in enumerate(rows):
+        toward = np.einsum("rtx,xm->rtm", ray[slab] / distance[slab, :, None], rot[i])
+        polarised = np.einsum("rtx,xm->rtm", theta[slab], rot[i])
+        own = np.stack([(unit * polarised).sum(-1) for unit in traced.spherical_units(toward)], axis=-1)
+        gain[slab] = np.einsum("ftl,frtp,rtp->rtl", weight, response[:, i], own)
+    turns = rf_hz * distance[..., None] / SPEED_MPS
+    return np.asarray(gain * traced.REFERENCE_M / distance[..., None] * np.exp(-2j * np.pi * turns))
+
+
+# -- the table -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """What came of a case."""
+
+    name: str
+    solved: int
+    of: int
+    rms_mrad: float
+    median_mrad: float
+    max_mrad: float
+    nees: float
+    within_3_sigma: float
+    silent: int
+    target_mrad: float | None
+    met: bool | None
+    today: str
+    reasons: dict[str, int]
+
+
+def row_of(case: Case, result: Result) -> Row:
+    """Compare a result with a case's truth."""
+    poses = result.poses
+    solved = poses.status == PoseStatus.OK
+    error = geometry.angle_between_rad(poses.normal_enu, case.normal_true_enu)
+    squared = _normalised(poses.normal_enu - case.normal_true_enu, poses.cov_enu, case.normal_true_enu)
+    level = np.full(error.shape, np.inf)
+    if result.integrity is not None:
+        level = result.integrity.protection_level_rad
+    with np.errstate(invalid="ignore"):
+        silent = solved & ((error > level) | (squared > 25.0))
+    mrad = 1e3 * error[solved]
+    rms = float(np.sqrt(np.mean(mrad**2))) if mrad.size else np.nan
+    nees = float(np.mean(squared[solved]) / 2.0) if mrad.size else np.nan
+    enough = bool(solved.mean() >= 0.95 and not silent.any() and 0.5 <= nees <= 1.5)
+    target = case.spec.target_mrad
+    status, count = np.unique(poses.status[~solved], return_counts=True)
+    return Row(
+        name=case.name,
+        solved=int(solved.sum()),
+        of=solved.size,
+        rms_mrad=rms,
+        median_mrad=float(np.median(mrad)) if mrad.size else np.nan,
+        max_mrad=float(mrad.max()) if mrad.size else np.nan,
+        nees=nees,
+        within_3_sigma=float(np.mean(squared[solved] <= 11.83)) if mrad.size else np.nan,
+        silent=int(silent.sum()),
+        target_mrad=target,
+        met=None if target is None else enough and rms <= target,
+        today=case.spec.today,
+        reasons={PoseStatus(s).reason: int(n) for s, n in zip(status, count, strict=True)},
+    )
+
+
+def _normalised(off: Array, cov: Array, normal: Array) -> Array:
+    """(frame, heliostat) squared error over covariance, of the two angles across the normal."""
+    across = geometry.rot_enu_from_mirror(normal)[..., :2]
+    two = np.einsum("fhxa,fhx->fha", across, off)
+    spread = np.einsum("fhxa,fhxy,fhyb->fhab", across, cov, across)
+    known = np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(two).all(axis=-1)
+    spread = np.where(known[..., None, None], spread, np.eye(2))
+    squared = np.einsum("fha,fhab,fhb->fh", two, np.linalg.inv(spread), two)
+    return np.where(known, squared, np.nan)
+
+
+def run(case: Case, pose: str) -> Row | str:
+    """Solve a case; or say why that was refused."""
+    settings = {"sample_rate": str(case.scenario.radio.sample_rate), "estimator": "correlator", "pose": pose}
+    try:
+        return row_of(case, solve(case.tones, case.scenario, settings=settings))
+    except RfposeError as error:
+        return str(error)
+
+
+def _printed(row: Row) -> str:
+    numbers = " / ".join(f"{x:.3g}" for x in (row.rms_mrad, row.median_mrad, row.max_mrad))
+    target = "" if row.target_mrad is None else f"{row.target_mrad:g}"
+    met = {None: "", True: "yes", False: "NO"}[row.met]
+    return (
+        f"| {row.name} | {row.solved}/{row.of} | {numbers} | {row.nees:.2f} | {100 * row.within_3_sigma:.0f} % "
+        f"| {row.silent} | {target} | {met} | {row.today} |"
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="tables and responses: ../shared/data/traced")
+    parser.add_argument("--tables", type=Path, help="ray tables of one's own")
+    parser.add_argument("--patterns", type=Path, help="antenna patterns")
+    parser.add_argument("--pose", default="site")
+    parser.add_argument("--case", default="", help="only cases whose name matches")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    folders = Folders(given=options.folder, own=options.tables, patterns=options.patterns)
+    if not (options.folder / "paths").is_dir():
+        sys.exit(f"{options.folder}: no folder of traced fields (it has no `paths`); give ../shared/data/traced")
+    report: list[dict[str, Any]] = []
+    if not options.json:
+        print("| case | solved | rms / median / max mrad | NEES | within 3 sigma | silent | target | met | before |")
+        print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    for spec in _specs():
+        if re.search(options.case, spec.name) is None:
+            continue
+        case = case_of(spec, folders)
+        row = case if isinstance(case, str) else run(case, options.pose)
+        if isinstance(row, str):
+            report.append({"name": spec.name, "missing": row})
+        else:
+            report.append({name: getattr(row, name) for name in Row.__dataclass_fields__})
+        if not options.json:
+            print(f"| {spec.name} | {row} |" if isinstance(row, str) else _printed(row), flush=True)
+    if options.json:
+        print(json.dumps({"pose": options.pose, "cases": report}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
