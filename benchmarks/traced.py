@@ -122,7 +122,7 @@ def neighbours_enu_m(site: Scenario) -> Array:
 
 
 def soil(rf_hz: float) -> tuple[float, float]:
-    """Return the ground's permittivity and conductivity [S/m]: medium dry ground of ITU-R P.2040, carried on downwards."""
+    """Return permittivity and conductivity [S/m] of ITU-R P.2040's medium dry ground, carried on below 1 GHz."""
     return 15.0, max(1e-3, 0.035 * (rf_hz / 1e9) ** 1.63)
 
 
