@@ -142,6 +142,88 @@ def add_factor_errors(begin, end, order, group, link_of, amplitude_error, phase_
 
 
 @kernel
+def add_soil_errors(begin, end, soil_slope, soil_error, link_of, part, h, row_of, share, n, s):
+    """Add to the covariance s what the ground's uncertain permittivity, one for all links, does to phases."""
+    for k in range(begin, end):
+        row = row_of[link_of[k]]
+        if row >= 0:
+            share[row] += part[k - begin] * soil_slope[k] / h[link_of[k]]
+    for i in range(n):
+        a = share[i]
+        for j in range(n):
+            b = share[j]
+            s[i, j] += soil_error[0] ** 2 * a.imag * b.imag + soil_error[1] ** 2 * a.real * b.real
+    share[:n] = 0.0
+
+
+@kernel
+def tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen):
+    """What measurements say of one standardised factor error: its estimate, and how much of it they tell (0 to 1)."""
+    u = 0.0
+    for i in range(n):
+        u += z_part[i] * own[i]
+        x = z_part[i]
+        for k in range(i):
+            x -= lower[i, k] * whitened[k]
+        whitened[i] = x / lower[i, i]
+    told = 0.0
+    for i in range(n):
+        told += whitened[i] ** 2
+    for p in range(n_par):
+        x = 0.0
+        for i in range(n):
+            x += a[i, p] * whitened[i]
+        for q in range(p):
+            x -= normal_lower[p, q] * seen[q]
+        seen[p] = x / normal_lower[p, p]
+        told -= seen[p] ** 2
+    return u, told
+
+
+@kernel
+def tell_factors(
+    begin, end, order, group, kind, link_of, amplitude_error, phase_error, soil_slope, soil_error, part, h, row_of, share,
+    n, own, lower, a, n_par, normal_lower, whitened, seen, z_part, out_factor, out_soil,
+):  # fmt: skip
+    """Sum, by kind of ray, what measurements say of factor errors; and of the ground's permittivity."""
+    k = begin
+    while k < end:
+        now = group[order[k]]
+        first = order[k]
+        share[:n] = 0.0
+        while k < end and group[order[k]] == now:
+            ray = order[k]
+            k += 1
+            row = row_of[link_of[ray]]
+            if now >= 0 and row >= 0:
+                share[row] += part[ray - begin] / h[link_of[ray]]
+        if now < 0:
+            continue
+        for i in range(n):
+            z_part[i] = amplitude_error[first] * share[i].imag
+        u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
+        out_factor[kind[first], 0] += u * u
+        out_factor[kind[first], 1] += told
+        for i in range(n):
+            z_part[i] = phase_error[first] * share[i].real
+        u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
+        out_factor[kind[first], 0] += u * u
+        out_factor[kind[first], 1] += told
+    share[:n] = 0.0
+    for k in range(begin, end):
+        row = row_of[link_of[k]]
+        if row >= 0:
+            share[row] += part[k - begin] * soil_slope[k] / h[link_of[k]]
+    for q in range(2):
+        for i in range(n):
+            z_part[i] = soil_error[q] * (share[i].imag if q == 0 else share[i].real)
+        u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
+        out_soil[q, 0] = u
+        out_soil[q, 1] = told
+    share[:n] = 0.0
+
+
+@kernel
 def wrapped(x):
     """In (−π, π]."""
     return np.pi - np.mod(np.pi - x, 2.0 * np.pi)
@@ -150,9 +232,10 @@ def wrapped(x):
 @kernel_rows
 def fit_mirrors(
     begin_row, end_row, rows, carrier, sigma, k_tx, unit_field, first, link_of, source, place, extra, voltage, slope,
-    order, group, amplitude_error, phase_error, reference_rot, start_pivot, start_rot, surveyed, pivot_info,
+    order, group, kind, amplitude_error, phase_error, soil_slope, soil_error, reference_rot, start_pivot, start_rot, surveyed, pivot_info,
     commanded_rot, posture_info, roll_info, clock_info, floor, nu, own_scale, max_steps,
-    out_pivot, out_rot, out_cov, out_weight, out_residual, out_sigma, out_scale, out_sum, out_dof, out_cost, out_steps,
+    out_pivot, out_rot, out_cov, out_weight, out_residual, out_sigma, out_scale, out_sum, out_dof, out_cost, out_steps, tells, out_factor,
+    out_soil,
 ):  # fmt: skip
     """Fit the pose of each mirror; see ``fit.fit_site`` for arguments, ``out_*`` for what it gives."""
     n_rx, n_tx = carrier.shape[1], carrier.shape[2]
@@ -182,6 +265,7 @@ def fit_mirrors(
     step_rot = np.empty((3, 3))
     moved = np.empty(3)
     off = np.empty(3)
+    whitened, z_part = np.empty(n_link), np.empty(n_link)
     beta = np.empty(n_tx, np.complex128)
     gain_a, gain_b = np.empty(n_tx), np.empty(n_tx)
     for i_row in range(begin_row, end_row):
@@ -247,6 +331,7 @@ def fit_mirrors(
             add_factor_errors(
                 begin, end, order, group, link_of, amplitude_error, phase_error, part, h, row_of, share, touched, s
             )
+            add_soil_errors(begin, end, soil_slope, soil_error, link_of, part, h, row_of, share, n, s)
             lower[:n, :n] = s[:n, :n]
             if not cholesky(lower, n):
                 failed = True
@@ -354,6 +439,12 @@ def fit_mirrors(
                 break
         if failed:
             continue
+        if tells:
+            out_factor[m] = 0.0
+            tell_factors(
+                begin, end, order, group, kind, link_of, amplitude_error, phase_error, soil_slope, soil_error, part, h,
+                row_of, share, n, own, lower, a, n_par, normal_lower, whitened, seen, z_part, out_factor[m], out_soil[m],
+            )
         cost = 0.0
         for i in range(n):
             cost += (nu + 1.0) * np.log1p(residual[i] ** 2 / (nu * variance[i])) + np.log(variance[i])

@@ -22,10 +22,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import fdtri
+from scipy.special import fdtri, gammaln
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
@@ -35,6 +36,7 @@ from rfpose.multilat.status import PoseStatus
 from rfpose.propagation import RayKind, Rays
 
 __all__ = [
+    "Common",
     "SiteKnowledge",
     "SiteObservations",
     "SitePoses",
@@ -49,10 +51,19 @@ ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
 _MAX_STEPS = 40
-_FLOOR_ROUNDS = 12
-_FLOOR_SETTLED = 0.02
-_FLOOR_MIRRORS = 400
-"""Mirrors, spread over all, from which the common floor is found."""
+_FIRST_FLOOR = 0.05
+_TAILS = (3.0, 8.0, 30.0)
+_LEARN_ROUNDS = 15
+_LEARN_SETTLED = 0.03
+_LEARN_MIRRORS = 400
+"""Mirrors, spread over all, from which is found what all have in common."""
+_LEAST_FACTOR_SCALE = 0.01
+_FACTOR_PRIOR = 1.0
+"""So many factors' worth count the stated sigmas against what residuals say of them."""
+_SOIL_STEP = 2.0
+"""Standard deviations by which the permittivity is changed at once: rays are linear in it for so far."""
+_LEAST_SOIL_SIGMA = 0.01
+"""Relative; no ground is of one permittivity all over."""
 _AMBIGUOUS_COST = 9.0
 """Two poses apart whose costs (twice the log likelihood) differ by less may each be the true one."""
 _TELLING = 3
@@ -133,6 +144,9 @@ class Voltages:
         Complex, the propagation phase of the path taken off.
     slope : (ray, xyz)
         Its derivative by a turn of the mirror about east, north and up [1/rad].
+    soil_slope : (ray,)
+        Relative change of the voltage by a relative change of the ground's complex permittivity; zero for rays that the
+        ground did not turn.
     reference_rot : (mirror, 3, 3)
         The orientation they hold for.
     """
@@ -140,12 +154,13 @@ class Voltages:
     rays: Rays
     voltage: ComplexArray
     slope: ComplexArray
+    soil_slope: ComplexArray
     reference_rot: FloatArray
 
 
 _FACTOR_SIGMA: dict[RayKind, tuple[float, float]] = {
     RayKind.DIRECT: (0.0, 0.0),
-    RayKind.GROUND: (0.3, 0.3),
+    RayKind.GROUND: (0.05, 0.05),
     RayKind.SPECULAR: (0.1, 0.3),
     RayKind.DIFFRACTED: (0.1, 0.3),
     RayKind.OWN_PLATE: (0.1, 0.3),
@@ -163,12 +178,15 @@ class SiteSettings:
     least_floor
         Residuals do not make it smaller than this.
     tail
-        Degrees of freedom ν of Student's t: the smaller, the less a link counts that is far off.
+        Degrees of freedom ν of Student's t: the smaller, the less a link counts that is far off. None: the one of
+        3, 8 and 30 that makes the residuals likeliest.
     own_scale
         How many degrees of freedom the mirrors' common floor counts against each mirror's own residuals; infinity: all
         mirrors alike.
     factor_sigma
         By `RayKind`: standard deviation of foreseen rays' factors, relative amplitude and phase [rad].
+    soil_sigma
+        Relative standard deviation of the ground's complex permittivity, real and imaginary part of its relative change.
     missed_detection
         Risk at which protection levels are exceeded.
     rounds
@@ -176,10 +194,11 @@ class SiteSettings:
     """
 
     floor: float | None = None
-    least_floor: float = 1e-3
-    tail: float = 3.0
+    least_floor: float = 1e-6
+    tail: float | None = None
     own_scale: float = 8.0
     factor_sigma: dict[RayKind, tuple[float, float]] = field(default_factory=lambda: dict(_FACTOR_SIGMA))
+    soil_sigma: tuple[float, float] = (0.3, 0.1)
     missed_detection: float = 1e-3
     rounds: int = 3
 
@@ -206,8 +225,8 @@ class SitePoses:
         The normal is off by more than this at the stated risk.
     status : (mirror,)
         `PoseStatus`.
-    common_floor
-        Of all mirrors.
+    common
+        What all mirrors have in common.
     """
 
     pivot_enu_m: FloatArray
@@ -220,7 +239,7 @@ class SitePoses:
     dof: FloatArray
     protection_level_rad: FloatArray
     status: IntArray
-    common_floor: float
+    common: Common
 
     @property
     def normal_enu(self) -> FloatArray:
@@ -234,8 +253,34 @@ class SitePoses:
         return np.asarray(cross @ self.cov[:, 3:, 3:] @ cross.swapaxes(1, 2))
 
 
-FieldAt = Callable[[FloatArray, FloatArray], Voltages]
-"""From pivots (mirror, xyz) and orientations (mirror, 3, 3) to what the antennas would receive there."""
+FieldAt = Callable[[FloatArray, FloatArray, complex], Voltages]
+"""From pivots (mirror, xyz), orientations (mirror, 3, 3) and a relative change of the ground's complex permittivity to
+what the antennas would receive there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Common:
+    """What all mirrors of a recording have in common, found from their residuals.
+
+    Attributes
+    ----------
+    floor
+        Strength of the field that nothing foresees, relative to the direct one.
+    tail
+        Degrees of freedom ν of the distribution of what nothing foresees.
+    factor_scale : (kind,)
+        By `RayKind`: how large factor errors are beside `SiteSettings.factor_sigma`.
+    soil_change
+        Relative change of the ground's complex permittivity against what was given.
+    soil_sigma
+        Its standard deviation, real and imaginary part.
+    """
+
+    floor: float
+    tail: float
+    factor_scale: FloatArray
+    soil_change: complex
+    soil_sigma: tuple[float, float]
 
 
 def fit_site(
@@ -261,16 +306,23 @@ def fit_site(
     """
     chosen = settings or SiteSettings()
     fit = _Fit(observations, knowledge, chosen)
+    given = Common(
+        floor=_FIRST_FLOOR if chosen.floor is None else chosen.floor,
+        tail=_TAILS[0] if chosen.tail is None else chosen.tail, factor_scale=np.ones(len(RayKind)), soil_change=0j, soil_sigma=chosen.soil_sigma,
+    )  # fmt: skip
     known = np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
     state = _State.begin(knowledge)
-    floor = 0.05 if chosen.floor is None else chosen.floor
+    common = given
+    # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
+    state = _of_all_starts(fit, field_at, state, known, common)
     for _ in range(chosen.rounds):
-        voltages = field_at(state.pivot, state.rot)
-        if chosen.floor is None:
-            floor = fit.common_floor(voltages, state, known, floor)
-        state = fit.run(voltages, state, np.flatnonzero(known), floor)
-    state = _of_all_starts(fit, field_at, state, known, floor)
-    return fit.outcome(state, known, floor)
+        voltages = field_at(state.pivot, state.rot, common.soil_change)
+        common = fit.learn(voltages, state, known, common)
+        if common.soil_change != 0j:
+            voltages = field_at(state.pivot, state.rot, common.soil_change)
+        state = fit.run(voltages, state, np.flatnonzero(known), common)
+    state = _of_all_starts(fit, field_at, state, known, common)
+    return fit.outcome(state, known, common)
 
 
 def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float) -> FloatArray:
@@ -339,6 +391,28 @@ class _State:
         )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What measurements say of factor errors: (mirror, kind, 2) squares and shares told; (mirror, 2, 2) of the soil."""
+
+    factor: FloatArray
+    soil: FloatArray
+
+    @classmethod
+    def of(cls, n: int) -> _Told:
+        return cls(np.full((n, len(RayKind), 2), np.nan), np.full((n, 2, 2), np.nan))
+
+
+def _t_constant(nu: float) -> float:
+    """Of minus twice Student's log likelihood of one residual, what does not depend on the residual."""
+    return float(np.log(nu * np.pi) - 2.0 * (gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu)))
+
+
+def _alike(one: Common, other: Common) -> bool:
+    change = np.abs(np.log(one.factor_scale / other.factor_scale)).max()
+    return bool(max(change, abs(np.log(one.floor / other.floor))) < _LEARN_SETTLED)
+
+
 class _Fit:
     """The kernel with everything that does not change from call to call."""
 
@@ -348,23 +422,26 @@ class _Fit:
             raise InvalidInputError("`observations` and `knowledge` are not of the same mirrors, receivers, transmitters")
         self.seen, self.known, self.settings = observations, knowledge, settings
 
-    def run(self, voltages: Voltages, state: _State, rows: IntArray, floor: float) -> _State:
+    def run(self, voltages: Voltages, state: _State, rows: IntArray, common: Common, told: _Told | None = None) -> _State:
         """Fit some mirrors from where they stand; the others stay."""
         seen, known, chosen, rays = self.seen, self.known, self.settings, voltages.rays
         out = replace(state)
         fresh = _State.empty(state.shape, state.pivot.copy(), state.rot.copy())
-        order, group, amplitude, phase, link_of = _grouped(rays, seen.carrier.shape, chosen.factor_sigma)
+        order, group, amplitude, phase, link_of = _grouped(
+            rays, seen.carrier.shape, chosen.factor_sigma, common.factor_scale
+        )
+        told = _Told.of(0) if told is None else told
         with np.errstate(divide="ignore"):
             info = [np.float64(s) ** -2.0 for s in (known.pivot_sigma_m, known.posture_sigma_rad, known.roll_sigma_rad)]
             clock_info = np.float64(known.clock_sigma_m) ** -2.0
         _kernels.fit_mirrors(
             len(rows), rows, seen.carrier, seen.sigma, seen.wavenumber_radpm, known.unit_field, rays.first, link_of,
             rays.source_enu_m, rays.place_mirror_m, rays.extra_m, voltages.voltage, voltages.slope, order, group,
-            amplitude, phase, voltages.reference_rot, state.pivot, state.rot, known.pivot_enu_m, float(info[0]),
-            known.commanded_rot, float(info[1]), float(info[2]), float(clock_info), floor, chosen.tail,
+            rays.kind, amplitude, phase, voltages.soil_slope, np.array(common.soil_sigma), voltages.reference_rot, state.pivot, state.rot, known.pivot_enu_m, float(info[0]),
+            known.commanded_rot, float(info[1]), float(info[2]), float(clock_info), common.floor, common.tail,
             0.0 if np.isinf(chosen.own_scale) else chosen.own_scale, _MAX_STEPS,
             fresh.pivot, fresh.rot, fresh.cov, fresh.weight, fresh.residual, fresh.sigma, fresh.scale, fresh.total,
-            fresh.dof, fresh.cost, fresh.steps,
+            fresh.dof, fresh.cost, fresh.steps, len(told.factor) > 0, told.factor, told.soil,
         )  # fmt: skip
         for name in ("pivot", "rot", "cov", "weight", "residual", "sigma", "scale", "total", "dof", "cost", "steps"):
             values = getattr(state, name).copy()
@@ -372,34 +449,71 @@ class _Fit:
             setattr(out, name, values)
         return out
 
-    def common_floor(self, voltages: Voltages, state: _State, known: BoolArray, floor: float) -> float:
-        """Return the floor that all mirrors' residuals ask for (restricted maximum likelihood)."""
+    def learn(self, voltages: Voltages, state: _State, known: BoolArray, common: Common) -> Common:
+        """Return what all mirrors' residuals say of what they have in common (restricted maximum likelihood)."""
         rows = np.flatnonzero(known)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _FLOOR_MIRRORS).astype(np.int64))] if len(rows) else rows
-        for _ in range(_FLOOR_ROUNDS):
-            state = self.run(voltages, state, rows, floor)
-            total, dof = state.total[rows], state.dof[rows]
-            told = np.isfinite(total) & (dof > 0.0)
-            if not told.any():
-                return floor
-            new = max(floor * float(np.sqrt(total[told].sum() / dof[told].sum())), self.settings.least_floor)
-            settled = abs(np.log(new / floor)) < _FLOOR_SETTLED
-            floor = new
-            if settled:
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _LEARN_MIRRORS).astype(np.int64))] if len(rows) else rows
+        tails = _TAILS if self.settings.tail is None else (self.settings.tail,)
+        best = np.inf
+        for tail in tails:
+            cost, found = self._learn_with(voltages, state, rows, replace(common, tail=tail))
+            if not cost < best:
                 break
-        return floor
+            best, chosen = cost, found
+        return common if np.isinf(best) else chosen
 
-    def outcome(self, state: _State, known: BoolArray, floor: float) -> SitePoses:
+    def _learn_with(
+        self, voltages: Voltages, state: _State, rows: IntArray, common: Common
+    ) -> tuple[float, Common]:
+        given = common
+        told = _Told.of(len(state.cost))
+        for _ in range(_LEARN_ROUNDS):
+            state = self.run(voltages, state, rows, common, told)
+            last, common = common, self._learned(state, told, rows, common)
+            if _alike(last, common):
+                break
+        n_link = np.isfinite(state.weight[rows]).sum(axis=(1, 2))
+        cost = state.cost[rows] + n_link * _t_constant(common.tail)
+        total = float(np.nansum(cost)) if np.isfinite(cost).any() else np.inf
+        return total, replace(common, **self._soil(told, rows, given))
+
+    def _learned(self, state: _State, told: _Told, rows: IntArray, common: Common) -> Common:
+        total, dof = state.total[rows], state.dof[rows]
+        ended = np.isfinite(total) & (dof > 0.0)
+        if not ended.any():
+            return common
+        floor = common.floor
+        if self.settings.floor is None:
+            floor *= float(np.sqrt(total[ended].sum() / dof[ended].sum()))
+        square, share = np.nansum(told.factor[rows], axis=0).T
+        change = np.sqrt((_FACTOR_PRIOR / common.factor_scale**2 + square) / (_FACTOR_PRIOR + share))
+        scale = np.clip(common.factor_scale * change, _LEAST_FACTOR_SCALE, 1.0 / _LEAST_FACTOR_SCALE)
+        return replace(common, floor=max(floor, self.settings.least_floor), factor_scale=scale)
+
+    def _soil(self, told: _Told, rows: IntArray, given: Common) -> dict[str, Any]:
+        """Join what mirrors say of the ground's permittivity, each about the mean that was given."""
+        estimate, share = np.moveaxis(np.nan_to_num(told.soil[rows]), 2, 0)
+        share = np.clip(share, 0.0, 1.0 - 1e-9)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            info = np.where(share > 1e-9, share / (1.0 - share), 0.0)
+            own = np.where(share > 1e-9, estimate / share, 0.0)
+        sigma = np.array(given.soil_sigma)
+        joint = (info * own).sum(axis=0) / (1.0 + info.sum(axis=0))
+        change = sigma * np.clip(joint, -_SOIL_STEP, _SOIL_STEP)
+        left = np.maximum(sigma / np.sqrt(1.0 + info.sum(axis=0)), np.minimum(_LEAST_SOIL_SIGMA, sigma))
+        return {"soil_change": given.soil_change + complex(*change), "soil_sigma": (float(left[0]), float(left[1]))}
+
+    def outcome(self, state: _State, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""
-        nu = self.settings.tail
+        nu = common.tail
         cov = state.cov * (nu + 3.0) / (nu + 1.0)  # expected information of Student's t, Lange et al. section 4
         order = [3, 4, 5, 0, 1, 2]
         cov = cov[:, order][:, :, order]
         status = np.full(len(known), PoseStatus.OK, np.int64)
         poses = SitePoses(
             pivot_enu_m=state.pivot, rot_enu_from_mirror=state.rot, cov=cov, weight=state.weight,
-            residual_rad=state.residual, sigma_rad=state.sigma, floor=floor * np.sqrt(state.scale), dof=state.dof,
-            protection_level_rad=np.full(len(known), np.nan), status=status, common_floor=floor,
+            residual_rad=state.residual, sigma_rad=state.sigma, floor=common.floor * np.sqrt(state.scale), dof=state.dof,
+            protection_level_rad=np.full(len(known), np.nan), status=status, common=common,
         )  # fmt: skip
         normal_cov = poses.normal_cov
         sigma = np.sqrt(np.trace(normal_cov, axis1=1, axis2=2))
@@ -424,26 +538,27 @@ def _redundancy(weight: FloatArray) -> IntArray:
     return np.asarray(used.sum(axis=(1, 2)) - used.any(axis=1).sum(axis=1) - 6)
 
 
-def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray, floor: float) -> _State:
+def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray, common: Common) -> _State:
     """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
     knowledge = fit.known
     lever = float(np.nanmax(np.linalg.norm(knowledge.receiver_mirror_m, axis=-1), initial=0.0))
     wavelength = 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
     turns = spread_starts(knowledge.posture_sigma_rad, max(lever, 1e-9), wavelength)[1:]
-    rows = np.flatnonzero(known & (state.steps > 0))
+    rows = np.flatnonzero(known)
     if not len(turns) or not len(rows):
         return state
     apart = 0.5 * wavelength / lever / 3.0
-    near = field_at(knowledge.pivot_enu_m, knowledge.commanded_rot)
+    near = field_at(knowledge.pivot_enu_m, knowledge.commanded_rot, common.soil_change)
     for w in turns:
         turned = np.empty((3, 3))
         _kernels.turn(w, turned)
         start = replace(state, pivot=knowledge.pivot_enu_m.copy(), rot=turned @ knowledge.commanded_rot)
-        found = fit.run(near, start, rows, floor)
+        found = fit.run(near, start, rows, common)
         off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
         ended = (found.steps > 0) & (found.steps < _MAX_STEPS)
+        first = ended & ~(state.steps > 0)
         other = ended & (off > apart)
-        better = other & (found.cost < state.cost)
+        better = first | (other & (found.cost < state.cost))
         gap = np.abs(found.cost - state.cost)
         state.ambiguous = np.where(better, gap < _AMBIGUOUS_COST, state.ambiguous | (other & (gap < _AMBIGUOUS_COST)))
         if better.any():
@@ -453,13 +568,13 @@ def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray
                 setattr(state, name, values)
             again = np.flatnonzero(better)
             ambiguous = state.ambiguous
-            state = fit.run(field_at(state.pivot, state.rot), state, again, floor)
+            state = fit.run(field_at(state.pivot, state.rot, common.soil_change), state, again, common)
             state.ambiguous = ambiguous
     return state
 
 
 def _grouped(
-    rays: Rays, shape: tuple[int, ...], factor_sigma: dict[RayKind, tuple[float, float]]
+    rays: Rays, shape: tuple[int, ...], factor_sigma: dict[RayKind, tuple[float, float]], scale: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]:
     """Put rays that share their factor's error beside each other, mirror by mirror.
 
@@ -479,7 +594,7 @@ def _grouped(
     mirror, link_of = np.divmod(link, n_link)
     transmitter = link_of % shape[2]
     sigma = np.array([factor_sigma.get(kind, (0.0, 0.0)) for kind in RayKind])
-    amplitude, phase = sigma[rays.kind].T
+    amplitude, phase = (sigma * scale[:, None])[rays.kind].T
     shared = np.where(rays.kind == RayKind.GROUND, 0, transmitter)
     thing = np.where(rays.kind == RayKind.GROUND, -1, rays.thing)
     key = np.stack([rays.kind, thing, shared], axis=1)
