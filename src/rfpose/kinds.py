@@ -14,6 +14,7 @@ FORMAT_KINDS = {
     "rfpose-result": "result",
     "rfpose-tracking": "track",
     "rfpose-mount": "model",
+    "rfpose-antenna": "antenna",
 }
 """Kinds by the format that files give themselves."""
 
@@ -22,16 +23,21 @@ _WORDS = {
     "result": "a result of `rfpose process`, which `rfpose evaluate`, `rfpose info` and `rfpose view` take",
     "track": "a run of `rfpose track`, which `rfpose info` and `rfpose view` take",
     "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate` and `rfpose info` take",
+    "antenna": "an antenna pattern, which `rfpose info` takes",
     "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
     "truth": "a truth, which `rfpose evaluate` takes beside a result",
 }
-_MADE = {"result": ("result", "`rfpose process`"), "track": ("tracking run", "`rfpose track`")}
+_MADE = {
+    "result": ("result", "`rfpose process`"),
+    "track": ("tracking run", "`rfpose track`"),
+    "antenna": ("antenna pattern", "`scripts/antenna_pattern.py`"),
+}
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
 
 def kind_of(path: str | Path) -> str | None:
-    """Return ``recording``, ``result``, ``track``, ``model``, ``scenario`` or ``truth``; None: nothing that is known.
+    """Return ``recording``, ``result``, ``track``, ``model``, ``antenna``, ``scenario`` or ``truth``; None: unknown.
 
     By what a file says of itself at its beginning; whether it is sound is for its reader to say.
     """
@@ -66,7 +72,7 @@ def _kind_of_hdf5(path: Path) -> str | None:
 
 
 def check_kind(path: str | Path, *, wanted: str) -> None:
-    """Refuse what is no ``result`` or no ``track`` by its beginning, before anything is loaded to read it.
+    """Refuse what is no ``result``, ``track`` or ``antenna`` by its beginning, before anything is loaded to read it.
 
     Raises
     ------

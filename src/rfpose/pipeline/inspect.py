@@ -18,7 +18,7 @@ __all__ = ["inspect_file"]
 
 
 def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, Any]:
-    """Describe a recording, a result, a tracking run, a scenario or a file of mounts, ready for JSON.
+    """Describe a recording, a result, a tracking run, a scenario, mounts or an antenna pattern, ready for JSON.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
     Returns
     -------
     dict
-        ``kind`` is ``"recording"``, ``"result"``, ``"track"`` (a tracking run), ``"scenario"`` or ``"model"`` (mounts);
-        ``sound`` tells whether ``problems`` is empty.
+        ``kind`` is ``"recording"``, ``"result"``, ``"track"`` (a tracking run), ``"scenario"``, ``"model"`` (mounts) or
+        ``"antenna"`` (a pattern); ``sound`` tells whether ``problems`` is empty.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
     """
     path = Path(path)
     kind = kind_of(path)
-    readers = {"model": _models, "result": _result, "track": _track}
+    readers = {"antenna": _antenna, "model": _models, "result": _result, "track": _track}
     if kind in readers:
         return {"kind": kind, "path": str(path), **readers[kind](path)}
     if kind == "truth":
@@ -130,6 +130,27 @@ def _track(path: Path) -> dict[str, Any]:
             }
             for name, m in ((name, track.methods[name]) for name in track.ranking())
         },
+        "problems": problems,
+        "sound": not problems,
+    }
+
+
+def _antenna(path: Path) -> dict[str, Any]:
+    import numpy as np
+
+    from rfpose.pipeline.formats.antenna_file import read_pattern
+
+    found = read_pattern(path)
+    pattern = found.pattern
+    n_polar = pattern.response.shape[2]
+    unknown = float(np.isnan(pattern.response).any(axis=-1).mean())
+    problems = [f"{unknown:.1%} of the directions are unknown"] if unknown else []
+    return {
+        "made_by": dict(found.made_by),
+        "receivers": pattern.n_receiver,
+        "frequency_hz": pattern.frequency_hz.tolist(),
+        "step_deg": 180.0 / (n_polar - 1),
+        "largest_sigma": float(pattern.sigma.max()),
         "problems": problems,
         "sound": not problems,
     }

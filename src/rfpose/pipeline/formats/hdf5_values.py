@@ -66,14 +66,14 @@ def array_of(file: h5py.File, place: str, dtype: Any) -> np.ndarray[Any, Any]:
         raise ValueError(f"holds {stored[values != stored].flat[0]}, which means nothing")
     if values.dtype.kind in "fc" and values.size:
         finite = np.where(np.isfinite(values), np.abs(values), 0.0)
-        if finite.max() > _LARGEST:
+        if float(finite.max()) > _LARGEST:
             raise ValueError(f"holds {values.ravel()[int(np.argmax(finite))]:.3g}, which nothing measured is")
     return values
 
 
 @contextlib.contextmanager
 def opened(path: Path, *, wanted: str, version: int, again: str) -> Iterator[h5py.File]:
-    """Open a ``result`` or a ``track``, as `rfpose.kinds` calls them; what h5py and numpy raise becomes our error.
+    """Open a ``result``, ``track`` or ``antenna`` of `rfpose.kinds`; what h5py and numpy raise becomes our error.
 
     Raises
     ------
