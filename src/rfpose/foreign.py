@@ -1,7 +1,7 @@
-"""Numbers and texts from files that somebody else wrote: bounded before memory or time is spent on them.
+"""Numbers, texts and arrays from files that somebody else wrote: bounded before memory or time is spent on them.
 
 A few bytes can ask for gigabytes: ``1e999999999`` as an exact fraction, brackets within brackets, a file that never
-ends. What is read here has a size, a depth and an exponent that are known beforehand.
+ends, an array whose header lies. What is read here has a size, a depth and an exponent that are known beforehand.
 """
 
 from __future__ import annotations
@@ -10,15 +10,22 @@ import json
 import math
 import numbers
 import re
+import sys
 import tomllib
-from collections.abc import Callable
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
+
+import numpy as np
+import numpy.typing as npt
 
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 
 __all__ = [
+    "ARRAY_BYTES",
     "RATE_LIMITS",
     "TEXT_BYTES",
     "exact_number",
@@ -27,12 +34,16 @@ __all__ = [
     "load_toml",
     "parse_json",
     "parse_toml",
+    "read_arrays",
     "read_text",
 ]
 
 TEXT_BYTES: Final = 2**24
 """A text file longer than this is refused unless its reader allows more; JSON takes up to some thirty times as much
 memory as it has bytes."""
+
+ARRAY_BYTES: Final = 2**29
+"""Arrays of one file that take more memory than this are refused unless their reader allows more."""
 
 _DEPTH: Final = 64
 _DIGITS: Final = 100
@@ -279,3 +290,77 @@ def _refuse_numbers(
         )
     elif finite and isinstance(value, float) and not math.isfinite(value):
         raise error(f"{source}: `{place}` is {value}, which is no JSON number; {remedy}")
+
+
+def read_arrays(
+    path: str | Path,
+    names: Iterable[str],
+    *,
+    limit: int = ARRAY_BYTES,
+    error: type[RfposeError] = RecordingError,
+    remedy: str = _REMEDY,
+) -> dict[str, npt.NDArray[Any]]:
+    """Read named arrays of numbers or text from numpy's ``.npz``; nothing in it is ever unpickled.
+
+    Parameters
+    ----------
+    path
+    names
+        Arrays that must be there; others are not looked at.
+    limit
+        Bytes that they may take together.
+    error, remedy
+        As for `read_text`.
+
+    Raises
+    ------
+    RfposeError
+        ``error``: no such file, no archive, damaged, an array missing, of objects, or larger than its file can hold.
+        The message names file and array.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            left, found = limit, {}
+            for name in names:
+                found[name] = _read_array(archive, f"{name}.npy", left)
+                left -= found[name].nbytes
+    except KeyError as failure:
+        raise error(f"{path}: lacks the array `{name}`; {remedy}") from failure
+    except OSError as failure:
+        raise error(f"{path}: cannot be read: {failure.strerror or failure}; {remedy}") from failure
+    # what a damaged archive raises differs by where the damage is
+    except (ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as failure:
+        raise error(f"{path}: no sound archive of arrays (numpy's npz): {failure}; {remedy}") from failure
+    return found
+
+
+def _read_array(archive: zipfile.ZipFile, member: str, limit: int) -> npt.NDArray[Any]:
+    """Return an array whose header agrees with the size of its member; ValueError says what does not."""
+    size = archive.getinfo(member).file_size
+    with archive.open(member) as file:
+        shape, by_columns, kind = _array_header(file, member)
+        if kind.kind not in "biufcU":
+            raise ValueError(f"`{member}` holds {kind}, neither numbers nor text")
+        count = math.prod(shape)
+        if count * kind.itemsize > limit:
+            raise ValueError(f"`{member}` of shape {shape} takes more than the {limit} bytes allowed")
+        content = file.read(min(count * kind.itemsize + 1, size))
+        if len(content) != count * kind.itemsize:
+            raise ValueError(f"`{member}` of shape {shape} should have {count * kind.itemsize} bytes")
+    array = np.frombuffer(content, kind).reshape(shape, order="F" if by_columns else "C")
+    array = array.astype(kind.newbyteorder("="), order="C")
+    if kind.kind == "U" and np.any(array.reshape(-1).view(np.uint32) > sys.maxunicode):
+        raise ValueError(f"`{member}` holds what is no text")
+    return array
+
+
+def _array_header(file: IO[bytes], member: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(file)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"`{member}` is of format version {version}")
+    shape, by_columns, kind = readers[version](file)
+    if any(n < 0 for n in shape):
+        raise ValueError(f"`{member}` has shape {shape}")
+    return shape, by_columns, kind

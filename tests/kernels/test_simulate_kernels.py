@@ -121,7 +121,8 @@ def test_phases_are_exact_at_samples_since_the_epoch(sample):
     range_m = np.array([[91.0, 93.5], [120.25, 130.125]])
     rays = _rays.make_rays(
         scenario,
-        range_m=range_m,
+        length_m=range_m,
+        gain=np.array([1.0, complex(-0.3, 0.1)]) * np.ones((2, 2)),
         pass_factor=np.array([1.0, 0.5]),
         carrier_phase_rad=theta,
         tone_phase_rad=phi,

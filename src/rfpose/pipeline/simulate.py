@@ -36,6 +36,8 @@ def simulate(scenario: Scenario | str | Path, *, seed: int = 0) -> SimulatedReco
     ------
     ScenarioError
         The scenario is malformed or cannot be simulated.
+    RecordingError
+        A ray table (``simulation.paths``) is missing or damaged.
 
     Examples
     --------
@@ -50,11 +52,10 @@ def simulate(scenario: Scenario | str | Path, *, seed: int = 0) -> SimulatedReco
     site = scenario_of(scenario)
     from rfpose.simulator import Simulator  # compiled code, which no refusal should wait for
 
+    file = None if isinstance(scenario, Scenario) else Path(scenario)
+    simulator = Simulator(site, seed=seed, folder=None if file is None else file.parent)
     return SimulatedRecording(
-        Simulator(site, seed=seed),
-        site,
-        seed=seed,
-        made_from=() if isinstance(scenario, Scenario) else (Path(scenario),),
+        simulator, site, seed=seed, made_from=simulator.files if file is None else (file, *simulator.files)
     )
 
 
@@ -86,7 +87,7 @@ class SimulatedRecording(Recording):
         return f"<SimulatedRecording {self._site.name!r}: {len(self.receiver_ids)} receivers, seed {seed}>"
 
     def files(self) -> list[Path]:
-        """Return the scenario's file, if it came from one."""
+        """Return what it is made from: the scenario's file, if it came from one, and ray tables."""
         return self._made_from
 
     def save(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rfpose.scenario.records import MAX_START_UNIX_S, Identifier, NonNegative, Positive, Record
 
@@ -37,6 +37,10 @@ class Dropout(Record):
     sample_count: Annotated[int, Field(gt=0)]
 
 
+FileName = Annotated[str, Field(min_length=1, max_length=4096)]
+PathPattern = Annotated[str, Field(min_length=1, max_length=200)]
+
+
 class Simulation(Record):
     """How `rfpose simulate` makes a recording of this scenario."""
 
@@ -65,3 +69,27 @@ class Simulation(Record):
     ground: Ground | None = None
     blocked: tuple[Blockage, ...] = ()
     dropped: tuple[Dropout, ...] = ()
+    paths: FileName | tuple[FileName, ...] | None = None
+    """Ray tables instead of rays from geometry: one file, or one a frame (docs/ray-tables.md)."""
+    path_antenna: Literal["isotropic", "dipole_y"] = "isotropic"
+    """What receives the rays of ``paths``."""
+    paths_without: tuple[PathPattern, ...] = ()
+    """Rays of ``paths`` that met such a thing are left out: shell patterns of the steps of their codes."""
+
+    @model_validator(mode="after")
+    def _paths_alone(self) -> Self:
+        if self.paths is None:
+            for key in ("path_antenna", "paths_without"):
+                if getattr(self, key) != type(self).model_fields[key].default:
+                    raise ValueError(f"`simulation.{key}` is about `simulation.paths`: give both, or neither")
+            return self
+        if self.ground is not None:
+            raise ValueError("`simulation.paths` holds the ground's rays, too: leave `simulation.ground` out")
+        if self.path_loss != "none":
+            raise ValueError("`simulation.paths` holds the loss of each ray: leave `simulation.path_loss` out")
+        if isinstance(self.paths, tuple) and len(self.paths) not in (1, self.frame_count):
+            raise ValueError(
+                f"`simulation.paths` must be one file, or one a frame: got {len(self.paths)} files and "
+                f"`simulation.frame_count` = {self.frame_count}"
+            )
+        return self

@@ -98,6 +98,8 @@ def sum_of_rays(
         n = np.uint64(first + start)
         for i in range(amplitude.shape[0]):
             for p in range(amplitude.shape[1]):
+                if amplitude[i, p] == 0.0:  # links have unequal numbers of rays
+                    continue
                 envelope[:] = 1.0
                 for q in range(tone_step.shape[0]):
                     angle = _radians(tone_turn[i, p, q] + n * tone_step[q])

@@ -1,4 +1,4 @@
-"""Where everything is in each frame: frame starts, mirror normals, receiver positions, lengths of the rays."""
+"""Where everything is in each frame: frame starts, mirror normals, receiver positions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rfpose.errors import ScenarioError
 from rfpose.scenario import MAX_SAMPLE_INDEX, Heliostat, Scenario
 from rfpose.scenario.records import MAX_START_UNIX_S
 
-__all__ = ["frame_start_index", "mirror_normal_enu", "ray_range_m", "receiver_enu_m"]
+__all__ = ["frame_start_index", "mirror_normal_enu", "receiver_enu_m"]
 
 _MIN_RANGE_M = 1e-6
 
@@ -119,40 +119,3 @@ def receiver_enu_m(scenario: Scenario, normal_enu: FloatArray) -> FloatArray:
     n_mirror_receiver = len(scenario.receivers) - len(scenario.calibration_receiver)
     position[:, n_mirror_receiver:] = scenario.calibration_enu_m
     return position
-
-
-def ray_range_m(scenario: Scenario, position_enu_m: FloatArray) -> FloatArray:
-    """Return the length of each ray (receiver, transmitter, ray) [m]: direct, then ground-reflected if there is ground.
-
-    Raises
-    ------
-    ScenarioError
-        A receiver stands where a transmitter stands, or one of them is below the ground.
-    """
-    ground = scenario.simulation.ground
-    source = scenario.transmitter_enu_m[:, None, :]
-    if ground is not None:
-        _check_above_ground(scenario, position_enu_m, ground.height_m)
-        image = source * [1.0, 1.0, -1.0] + [0.0, 0.0, 2.0 * ground.height_m]
-        source = np.concatenate([source, image], axis=1)
-    distance = np.linalg.norm(position_enu_m[:, None, None, :] - source, axis=-1)
-    if np.any(distance < _MIN_RANGE_M):
-        r, i, _ = np.argwhere(distance < _MIN_RANGE_M)[0]
-        raise ScenarioError(
-            f"receiver `{scenario.receiver_ids[r]}` stands where transmitter `{scenario.transmitter_ids[i]}` stands; "
-            "move one of them"
-        )
-    return np.asarray(distance)
-
-
-def _check_above_ground(scenario: Scenario, position_enu_m: FloatArray, ground_height_m: float) -> None:
-    for kind, ids, height_m in (
-        ("transmitter", scenario.transmitter_ids, scenario.transmitter_enu_m[:, 2]),
-        ("receiver", scenario.receiver_ids, position_enu_m[:, 2]),
-    ):
-        if np.any(height_m < ground_height_m):
-            i = int(np.argmax(height_m < ground_height_m))
-            raise ScenarioError(
-                f"{kind} `{ids[i]}` at height {height_m[i]:.4g} m lies below the ground at {ground_height_m:g} m; "
-                "lower `simulation.ground.height_m` or raise the position"
-            )

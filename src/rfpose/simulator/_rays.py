@@ -16,9 +16,10 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.scenario import Scenario
 
-__all__ = ["Rays", "amplitude_of_rays", "make_rays"]
+__all__ = ["Rays", "make_rays"]
 
 Uint64 = npt.NDArray[np.uint64]
+ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,33 +33,11 @@ class Rays:
     tone_step: Uint64
 
 
-def amplitude_of_rays(scenario: Scenario, range_m: FloatArray) -> FloatArray:
-    """Return the amplitude of each ray, nothing being in its way.
-
-    Parameters
-    ----------
-    scenario
-    range_m : (..., transmitter, ray)
-        Length of each ray [m].
-
-    Returns
-    -------
-    (..., transmitter, ray)
-        In units of a transmitter of amplitude one at the reference range.
-    """
-    simulation = scenario.simulation
-    amplitude = np.array([t.amplitude for t in scenario.transmitter])[:, None] * np.ones(range_m.shape)
-    if simulation.path_loss == "free_space":
-        amplitude *= simulation.reference_range_m / range_m
-    if simulation.ground is not None:
-        amplitude[..., 1] *= abs(complex(*simulation.ground.coefficient))
-    return amplitude
-
-
 def make_rays(
     scenario: Scenario,
     *,
-    range_m: FloatArray,
+    length_m: FloatArray,
+    gain: ComplexArray,
     pass_factor: FloatArray,
     carrier_phase_rad: FloatArray,
     tone_phase_rad: FloatArray,
@@ -77,7 +56,8 @@ def make_rays(
     Parameters
     ----------
     scenario
-    range_m : (transmitter, ray)
+    length_m, gain : (transmitter, ray)
+        As in `Paths`.
     pass_factor : (transmitter,)
         What is left of the amplitude behind an obstacle.
     carrier_phase_rad : (transmitter,)
@@ -90,7 +70,7 @@ def make_rays(
         Samples since the epoch at the nominal rate.
     sample_in_run
     """
-    radio, ground = scenario.radio, scenario.simulation.ground
+    radio = scenario.radio
     clock = Fraction(clock_ppm * 1e-6)
     rate = radio.sample_rate * (1 + clock)
     # ideal time of the frame's first sample, since the epoch [s]
@@ -98,15 +78,13 @@ def make_rays(
     beat = [Fraction(f) - Fraction(radio.centre_frequency_hz) * clock for f in scenario.carrier_hz.tolist()]
     tone = [Fraction(f) for f in scenario.tone_hz.tolist()]
 
-    tau = range_m / radio.propagation_speed_mps + delay_s
+    tau = length_m / radio.propagation_speed_mps + delay_s
     carrier_rf_hz = radio.centre_frequency_hz + scenario.carrier_hz
-    carrier_rad = np.repeat(carrier_phase_rad[:, None] + oscillator_phase_rad, range_m.shape[1], axis=1)
-    if ground is not None:
-        carrier_rad[:, 1] += np.angle(complex(*ground.coefficient))
+    carrier_rad = (carrier_phase_rad + oscillator_phase_rad)[:, None] + np.angle(gain)
     carrier_turns = carrier_rad / (2.0 * np.pi) - carrier_rf_hz[:, None] * tau
     tone_turns = tone_phase_rad[:, None, :] / (2.0 * np.pi) - tau[:, :, None] * scenario.tone_hz
     return Rays(
-        amplitude=amplitude_of_rays(scenario, range_m) * pass_factor[:, None],
+        amplitude=np.abs(gain) * pass_factor[:, None],
         carrier_turn=_turns_from_fractions([f * time for f in beat])[:, None] + _turns_from_floats(carrier_turns),
         carrier_step=_turns_from_fractions([f / rate for f in beat]),
         tone_turn=_turns_from_fractions([f * time for f in tone]) + _turns_from_floats(tone_turns),

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +19,8 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.jit import load_numba
 from rfpose.scenario import Receiver, Scenario
-from rfpose.simulator import _draws, _kernels, _motion, _rays
+from rfpose.simulator import _draws, _kernels, _motion, _rays, _tables
+from rfpose.simulator._paths import Paths, paths_from_geometry
 from rfpose.truth import Truth
 
 __all__ = ["CHUNK_SAMPLES", "Chunk", "Simulator"]
@@ -74,6 +76,8 @@ class Simulator:
         What to simulate; its ``simulation`` table says how.
     seed
         Everything random follows from it.
+    folder
+        Where the scenario's file is: relative names of ray tables are looked for there first.
 
     Attributes
     ----------
@@ -81,6 +85,8 @@ class Simulator:
         What is really there.
     receiver_ids
         In the order in which a frame's samples come.
+    files
+        Ray tables that were read.
     frame_start_index : (frame,) int64
         First sample of each frame, counted from the Unix epoch at the nominal rate.
     sample_format
@@ -101,13 +107,17 @@ class Simulator:
     ------
     ScenarioError
         The scenario cannot be simulated: a heliostat without posture, overlapping frames, a receiver on top of a
-        transmitter, an impairment of a frame that does not exist. Names the key to change.
+        transmitter, an impairment of a frame that does not exist, a ray table of another site or posture. Names the
+        key to change.
+    RecordingError
+        A ray table is missing or damaged.
     InvalidInputError
         ``seed`` is not a non-negative integer.
     """
 
     truth: Truth
     receiver_ids: tuple[str, ...]
+    files: tuple[Path, ...]
     frame_start_index: npt.NDArray[np.int64]
     sample_format: Literal["int16", "complex64"]
     full_scale: float
@@ -116,7 +126,7 @@ class Simulator:
     total_samples: int
     draws: _draws.Draws
 
-    def __init__(self, scenario: Scenario, *, seed: int) -> None:
+    def __init__(self, scenario: Scenario, *, seed: int, folder: Path | None = None) -> None:
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
             raise InvalidInputError(f"`seed` must be a non-negative integer, got {seed!r}")
         _check(scenario)
@@ -138,10 +148,14 @@ class Simulator:
         )
         normal_enu = _motion.mirror_normal_enu(scenario)
         self._receiver_enu_m = _motion.receiver_enu_m(scenario, normal_enu)
+        self._tables = _tables.SiteTables.of(scenario, normal_enu, self._receiver_enu_m, folder)
+        if self._tables is not None:
+            self._receiver_enu_m = self._tables.receiver_enu_m
+        self.files = () if self._tables is None else self._tables.files
         self._pass_factor = _pass_factor(scenario)
 
         self.noise_sigma = scenario.tone[0].modulation_index * 10.0 ** (-simulation.tone_snr_db / 20.0) / np.sqrt(2.0)
-        amplitude, peak = self._direct_amplitude_and_peak()
+        amplitude, peak = self._signal_and_peak()
         if simulation.sample_format == "int16":
             self.full_scale = 2.0 ** (simulation.adc_bits - 1) - 1.0
             peak += _NOISE_PEAK_SIGMA * self.noise_sigma
@@ -196,8 +210,7 @@ class Simulator:
         i_receiver = self.receiver_ids.index(receiver_id)
         i_frame = int(np.searchsorted(self.frame_start_index, start_index, side="right")) - 1
         begin = start_index - int(self.frame_start_index[i_frame])
-        range_m = _motion.ray_range_m(self._scenario, self._receiver_enu_m[i_frame])[i_receiver]
-        rays = self._rays_of(i_frame, i_receiver, range_m)
+        rays = self._rays_of(i_frame, i_receiver, self._paths(i_frame))
 
         def piece(i_chunk: int) -> tuple[int, Samples]:
             first = max(begin, i_chunk * CHUNK_SAMPLES)
@@ -212,21 +225,28 @@ class Simulator:
     def _jobs(self) -> Iterator[_Job]:
         n_sample = self._scenario.radio.frame_samples
         for i_frame in range(len(self.frame_start_index)):
-            range_m = _motion.ray_range_m(self._scenario, self._receiver_enu_m[i_frame])
+            paths = self._paths(i_frame)
             for i_receiver in range(len(self.receiver_ids)):
-                rays = self._rays_of(i_frame, i_receiver, range_m[i_receiver])
+                rays = self._rays_of(i_frame, i_receiver, paths)
                 lost = self._lost.get((i_frame, i_receiver), [])
                 for i_chunk, first in enumerate(range(0, n_sample, CHUNK_SAMPLES)):
                     kept = _kept_stretches(first, min(first + CHUNK_SAMPLES, n_sample), lost)
                     if kept:
                         yield _Job(i_frame, i_receiver, i_chunk, rays, kept)
 
-    def _rays_of(self, i_frame: int, i_receiver: int, range_m: FloatArray) -> _rays.Rays:
+    def _paths(self, i_frame: int) -> Paths:
+        """Return a frame's rays: those of its table, else from geometry."""
+        if self._tables is not None:
+            return self._tables.paths(i_frame)
+        return paths_from_geometry(self._scenario, self._receiver_enu_m[i_frame])
+
+    def _rays_of(self, i_frame: int, i_receiver: int, paths: Paths) -> _rays.Rays:
         draws = self.draws
         run_start_index = int(self._run_start_index[i_frame])
         return _rays.make_rays(
             self._scenario,
-            range_m=range_m,
+            length_m=paths.length_m[i_receiver],
+            gain=paths.gain[i_receiver],
             pass_factor=self._pass_factor[i_frame, i_receiver],
             carrier_phase_rad=draws.carrier_phase_rad,
             tone_phase_rad=draws.tone_phase_rad[i_frame],
@@ -279,17 +299,16 @@ class Simulator:
             n_sample - sum(b - a for a, b in _kept_stretches(0, n_sample, lost)) for lost in self._lost.values()
         )
 
-    def _direct_amplitude_and_peak(self) -> tuple[FloatArray, float]:
-        """Return direct rays' amplitudes (frame, receiver, transmitter) and the largest that a signal can become."""
+    def _signal_and_peak(self) -> tuple[FloatArray, float]:
+        """Return signals' amplitudes (frame, receiver, transmitter) and the largest that a sample can become."""
         crest = 1.0 + sum(t.modulation_index for t in self._scenario.tone)
-        direct = np.empty(self._pass_factor.shape)
+        signal = np.empty(self._pass_factor.shape)
         peak = 0.0
-        for i_frame, position_enu_m in enumerate(self._receiver_enu_m):
-            range_m = _motion.ray_range_m(self._scenario, position_enu_m)
-            amplitude = _rays.amplitude_of_rays(self._scenario, range_m)
-            direct[i_frame] = amplitude[..., 0] * self._pass_factor[i_frame]
-            peak = max(peak, crest * float(amplitude.sum(axis=(-2, -1)).max()))
-        return direct, peak
+        for i_frame in range(len(signal)):
+            paths = self._paths(i_frame)
+            signal[i_frame] = paths.signal * self._pass_factor[i_frame]
+            peak = max(peak, crest * float(np.abs(paths.gain).sum(axis=(-2, -1)).max()))
+        return signal, peak
 
 
 def _check(scenario: Scenario) -> None:
