@@ -136,3 +136,99 @@ def test_missing_and_binary_files(tmp_path):
     (tmp_path / "binary.toml").write_bytes(b"\x89HDF\r\n\xff\xfe")
     with pytest.raises(ScenarioError, match=r"binary\.toml: is not text in UTF-8 .*check that it is the right file"):
         load_scenario(tmp_path / "binary.toml")
+
+
+STRUCTURES = """
+[site.structures]
+width_m = 2.0
+height_m = 1.5
+[[site.structures.box]]
+id = "tower"
+base_enu_m = [0.0, 0.0, 0.0]
+size_m = [6.0, 4.0, 46.0]
+azimuth_deg = 90.0
+[[site.structures.plate]]
+id = "N1"
+pivot_enu_m = [24.0, 3.0, 2.0]
+[[site.structures.plate]]
+id = "N2"
+pivot_enu_m = [20.0, 8.0, 2.0]
+height_m = 3.0
+arm_m = 0.2
+"""
+BARE = TABLE2.replace("[radio]", STRUCTURES + "[radio]", 1)
+
+
+def test_structures_stand_where_they_are_said_to_and_scale_with_the_site():
+    s = parse_scenario(BARE)
+    plates = s.site.structures.plate
+    assert [(p.width_m, p.height_m, p.arm_m) for p in plates] == [(2.0, 1.5, 0.0), (2.0, 3.0, 0.2)]
+    assert parse_scenario(s.to_toml()) == s
+    assert [m.id for m in s.mirrors[-2:]] == ["N1", "N2"]
+    np.testing.assert_allclose(s.mirror_pivot_enu_m[-1], [20.0, 8.0, 2.0])
+    large = s.scaled(2.0).site.structures
+    assert large.box[0].size_m == (12.0, 8.0, 92.0)
+    assert (large.plate[1].width_m, large.plate[1].arm_m) == (4.0, 0.4)
+    assert large.plate[1].pivot_enu_m == (40.0, 16.0, 4.0)
+
+
+def test_a_box_holds_what_lies_in_it_as_it_is_turned():
+    box = parse_scenario(BARE).site.structures.box[0]  # its y side, 4 m, looks east
+    assert box.holds((1.9, 2.9, 45.9))
+    assert not box.holds((2.1, 0.0, 10.0))
+    assert not box.holds((0.0, 0.0, 46.1))
+    assert not box.holds((0.0, 0.0, -0.1))
+
+
+def test_plates_come_from_a_plan_that_also_has_the_mirrors_with_receivers(tmp_path):
+    plan = tmp_path / "field.csv"
+    plan.write_text("id,east_m,north_m,up_m\nH01,20.0,0.1,2.0\nN1,24,3,2\nP7,70,10,2\n")
+    text = BARE.replace("[site.structures]\n", f'[site.structures]\ncsv = "{plan}"\n', 1)
+    plates = parse_scenario(text).site.structures.plate
+    assert [p.id for p in plates] == ["N1", "N2", "P7"]
+    assert plates[2].pivot_enu_m == (70.0, 10.0, 2.0)
+    assert plates[2].height_m == 1.5
+    plan.write_text("id,east_m,north_m,up_m\nH01,60.0,0.1,2.0\n")
+    with pytest.raises(ScenarioError, match="`H01` names a heliostat and a plate"):
+        parse_scenario(text)
+    plan.write_text("id,east_m,north_m\nP1,left,0.1\n")
+    with pytest.raises(ScenarioError, match=r"field\.csv: line 2, `east_m`"):
+        parse_scenario(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("height_m = 1.5\n", "", "plate `N1` has no `height_m`; give it there, or in .site.structures."),
+        ('id = "N2"', 'id = "N1"', "`N1` names two of kind plate"),
+        ('id = "N2"', 'id = "tower"', "`tower` names a box and a plate"),
+        ('id = "N2"', 'id = "H02"', "`H02` names a heliostat and a plate"),
+        ("[6.0, 4.0, 46.0]", "[6.0, 4.0, 50.0]", "box `tower` of .site.structures. covers transmitter `T10`"),
+        ("[6.0, 4.0, 46.0]", "[6.0, 46.0, 46.0]", "box `tower` of .site.structures. covers pivot of heliostat `H01`"),
+        ("[6.0, 4.0, 46.0]", "[6.0, 0.0, 46.0]", r"site\.structures\.box\[0\]\.size_m"),
+        ("[site.structures]\n", "[site.structures]\ncsv = 3\n", "path of a file"),
+        ("arm_m = 0.2", "arm_m = 0.2\nnormal_enu = [0, 0, 0]", "must not be zero"),
+        ("[mirror]\n", "[mirror]\nwidth_m = 2.0\n", "give both or neither"),
+        ("[radio]\n", "[posture]\nsigma_rad = 0.0\n[radio]\n", "posture.sigma_rad"),
+    ],
+)
+def test_structures_that_cannot_be_are_named(old, new, words):
+    assert old in BARE
+    with pytest.raises(ScenarioError, match=words) as caught:
+        parse_scenario(BARE.replace(old, new, 1), source="site.toml")
+    assert str(caught.value).startswith("site.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_structure_on_a_calibration_receiver_is_refused():
+    s = parse_scenario(TABLE2)
+    place = s.calibration_enu_m[0]
+    box = {"id": "hut", "base_enu_m": tuple(place - [0.0, 0.0, 1.0]), "size_m": (2.0, 2.0, 3.0)}
+    with pytest.raises(ScenarioError, match=r"box `hut` .* covers calibration receiver `cal0`"):
+        s.changed(site={"structures": {"box": (box,)}})
+
+
+def test_outlines_of_mirrors_are_optional_and_their_own():
+    s = parse_scenario(TABLE2.replace("[mirror]\n", "[mirror]\nwidth_m = 2.0\nheight_m = 1.5\n"))
+    assert {(h.width_m, h.height_m) for h in s.heliostat} == {(2.0, 1.5)}
+    assert parse_scenario(TABLE2).heliostat[0].width_m is None

@@ -22,11 +22,11 @@ from rfpose.scenario.records import (
     Heliostat,
     Mirror,
     Radio,
-    Site,
     Tone,
     Transmitter,
 )
 from rfpose.scenario.simulation import Blockage, Dropout, Ground, Simulation
+from rfpose.scenario.site import Box, Posture, Site, StructurePlate, Structures
 
 __all__ = [
     "ID_PATTERN",
@@ -36,6 +36,7 @@ __all__ = [
     "MIN_FRAME_SAMPLES",
     "SPEED_OF_LIGHT_MPS",
     "Blockage",
+    "Box",
     "Budget",
     "CalibrationReceiver",
     "Dropout",
@@ -45,12 +46,15 @@ __all__ = [
     "Mirror",
     "Motion",
     "Plane",
+    "Posture",
     "Radio",
     "Receiver",
     "Reflection",
     "Scenario",
     "Simulation",
     "Site",
+    "StructurePlate",
+    "Structures",
     "Tone",
     "Transmitter",
     "check_scenario",

@@ -38,6 +38,31 @@ def _check_receiver_ids(s: Scenario) -> None:
         raise ValueError(f"receiver `{receiver.id}` {belongs}; identifiers must be unique")
 
 
+def _check_things(s: Scenario) -> None:
+    structures = s.site.structures
+    things = (("heliostat", s.heliostat), ("box", structures.box), ("plate", structures.plate))
+    owner: dict[str, str] = {}
+    for kind, those in things:
+        for thing in those:
+            if thing.id in owner:
+                both = f"two of kind {kind}" if owner[thing.id] == kind else f"a {owner[thing.id]} and a {kind}"
+                raise ValueError(f"`{thing.id}` names {both}; things on a site need identifiers of their own")
+            owner[thing.id] = kind
+    standing = [
+        *(("transmitter", t.id, t.position_enu_m) for t in s.transmitter),
+        *(("calibration receiver", c.id, c.position_enu_m) for c in s.calibration_receiver),
+        *(("pivot of heliostat", h.id, h.pivot_enu_m) for h in s.heliostat),
+        *(("pivot of plate", p.id, p.pivot_enu_m) for p in structures.plate),
+    ]
+    for box in structures.box:
+        for kind, name, place in standing:
+            if box.holds(place):
+                raise ValueError(
+                    f"box `{box.id}` of [site.structures] covers {kind} `{name}`; move one of them, or correct the "
+                    "box's `base_enu_m`, `size_m` or `azimuth_deg`"
+                )
+
+
 def _check_transmitters_apart(s: Scenario) -> None:
     for (i, a), (j, b) in itertools.combinations(enumerate(s.transmitter_enu_m), 2):
         if np.linalg.norm(a - b) < 1e-6:
@@ -105,6 +130,7 @@ def _check_clock_can_be_found(s: Scenario) -> None:
 
 CHECKS: tuple[Callable[[Scenario], None], ...] = (
     _check_ids,
+    _check_things,
     _check_transmitters_apart,
     _check_modulation,
     _check_lines_in_band,

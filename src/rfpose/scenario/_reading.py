@@ -15,6 +15,7 @@ from rfpose.kinds import told_kind
 from rfpose.scenario._scenario import Scenario
 from rfpose.scenario._words import in_words
 from rfpose.scenario.records import Mirror
+from rfpose.scenario.site import fill_structures
 
 SCENARIO_BYTES = 2**26
 """Of a scenario's text: a hundred thousand heliostats."""
@@ -58,6 +59,7 @@ def parse_scenario(text: str, *, source: str = "scenario", scale: float | None =
         if not isinstance(file_scale, int | float) or isinstance(file_scale, bool):
             raise ScenarioError(f"`scale` must be a number, got {file_scale!r}")
         _fill_heliostats(data)
+        fill_structures(data)
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(f"{source}: {in_words(error)}") from error

@@ -8,6 +8,7 @@ _LENGTH_KEYS = frozenset(
     {
         "aim_enu_m",
         "arm_m",
+        "base_enu_m",
         "field_radius_m",
         "ground_height_sigma_m",
         "height_m",
@@ -20,10 +21,12 @@ _LENGTH_KEYS = frozenset(
         "receiver_mirror_m",
         "receiver_mirror_sigma_m",
         "reference_range_m",
+        "size_m",
         "survey_sigma_m",
         "target_enu_m",
         "transmitter_survey_sigma_m",
         "wavelength_m",
+        "width_m",
     }
 )
 
@@ -37,6 +40,7 @@ def scale_lengths(node: Any, factor: float) -> None:
             if key == "site":  # height above sea level is no part of the layout
                 if "aim_enu_m" in value:
                     value["aim_enu_m"] = _times(value["aim_enu_m"], factor)
+                scale_lengths(value.get("structures"), factor)
             elif key in _LENGTH_KEYS:
                 node[key] = _times(value, factor)
             else:

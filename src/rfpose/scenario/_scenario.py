@@ -23,8 +23,9 @@ from rfpose.scenario._words import in_words
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Reflection
 from rfpose.scenario.positions import read_positions
-from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Site, Tone, Transmitter
+from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
+from rfpose.scenario.site import Posture, Site, StructurePlate
 from rfpose.scenario.tracking import Tracking
 from rfpose.shown import counted, html_table, listed
 
@@ -53,6 +54,7 @@ class Scenario(Record):
     heliostat: tuple[Heliostat, ...] = ()
     simulation: Simulation = Simulation()
     reflection: Reflection = Reflection()
+    posture: Posture = Posture()
     integrity: Integrity = Integrity()
     motion: Motion = Motion()
     budget: Budget = Budget()
@@ -118,6 +120,16 @@ class Scenario(Record):
     def pivot_enu_m(self) -> FloatArray:
         """(heliostat, xyz) pivot positions [m]."""
         return read_only(np.array([h.pivot_enu_m for h in self.heliostat]).reshape(-1, 3))
+
+    @cached_property
+    def mirrors(self) -> tuple[Heliostat | StructurePlate, ...]:
+        """All mirrors that stand on the site: the heliostats, then the plates of ``[site.structures]``."""
+        return (*self.heliostat, *self.site.structures.plate)
+
+    @cached_property
+    def mirror_pivot_enu_m(self) -> FloatArray:
+        """(mirror, xyz) pivots of `mirrors` [m]."""
+        return read_only(np.array([m.pivot_enu_m for m in self.mirrors]).reshape(-1, 3))
 
     @cached_property
     def transmitter_ids(self) -> tuple[str, ...]:

@@ -34,16 +34,6 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Site(Record):
-    """Where the field is. Latitude and longitude place the sun; they are not needed to process radio."""
-
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
-    height_m: float = 0.0
-    aim_enu_m: Point | None = None
-    """Aim point of the heliostats (the tower's receiver)."""
-
-
 class Radio(Record):
     """The recorded band and how it is cut into frames."""
 
@@ -100,6 +90,9 @@ class Mirror(Record):
 
     receiver_mirror_m: tuple[Point, ...] | None = None
     arm_m: NonNegative = 0.0
+    width_m: Positive | None = None
+    height_m: Positive | None = None
+    """The mirror's outline, along its x and y; without it the mirror hides and reflects nothing."""
     oscillator: Literal["shared", "separate"] = "shared"
     receiver_delay_sigma_s: NonNegative | None = None
     """How well the delays between a mirror's receivers are known; without it they are unknown in every frame."""
@@ -121,6 +114,8 @@ class Heliostat(Record):
     receiver_mirror_m: tuple[Point, ...]
     receiver_ids: tuple[Identifier, ...]
     arm_m: NonNegative = 0.0
+    width_m: Positive | None = None
+    height_m: Positive | None = None
     oscillator: Literal["shared", "separate"] = "shared"
     receiver_delay_sigma_s: NonNegative | None = None
     receiver_delay_drift_s_per_sqrt_min: NonNegative | None = None
@@ -139,6 +134,8 @@ class Heliostat(Record):
             raise ValueError(f"`receiver_ids` must name all {n} receivers, got {len(self.receiver_ids)}")
         if geometry.is_collinear(self.receiver_mirror_m):
             raise ValueError("`receiver_mirror_m` must not lie on a line: a line fixes no normal; move one aside")
+        if (self.width_m is None) != (self.height_m is None):
+            raise ValueError("`width_m` and `height_m` outline a mirror together: give both or neither")
         if self.normal_enu is not None and math.hypot(*self.normal_enu) < 1e-9:
             raise ValueError("`normal_enu` must not be zero")
         if self.receiver_delay_drift_s_per_sqrt_min is not None:
