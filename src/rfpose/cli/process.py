@@ -26,7 +26,7 @@ __all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "REFLECTION_NAMES", "command"]
 
 # Written out so that --help need not load the signal processing; a test holds them to what they name.
 ESTIMATOR_NAMES = ("hilbert", "correlator", "dot", "dot-compensated")
-POSE_NAMES = ("rigid", "independent")
+POSE_NAMES = ("rigid", "site", "independent")
 REFLECTION_NAMES = ("estimate", "ignore")
 
 

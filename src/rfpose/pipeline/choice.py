@@ -10,9 +10,10 @@ from rfpose.scenario import Scenario
 
 __all__ = ["POSES", "REFLECTIONS", "PoseChoice", "choose"]
 
-POSES = ("rigid", "independent")
+POSES = ("rigid", "site", "independent")
 """Ways to a mirror's normal. ``independent``: each receiver is located on its own, the normal is their plane's, as
-published. ``rigid``: all phases of a mirror's receivers at once, with what the scenario says of clocks and pivots."""
+published. ``rigid``: all phases of a mirror's receivers at once, with what the scenario says of clocks and pivots.
+``site``: the carriers' phases, with the rays that ground, mirrors and structures send to each receiver."""
 
 REFLECTIONS = ("estimate", "ignore")
 """What may be asked for instead of what the scenario says of reflections."""
@@ -114,7 +115,7 @@ def choose(
         ):
             if asked:
                 raise InvalidInputError(f"`{name}` is of pose `rigid`; pose `{pose}` has no such thing: leave it away")
-        return PoseChoice(pose=pose, reflection="none", integrity=False)
+        return PoseChoice(pose=pose, reflection="none", integrity=pose == "site")
     model: str = scenario.reflection.model
     if reflection is not None:
         model = "estimate" if reflection == "estimate" else "none"

@@ -26,7 +26,8 @@ from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.mirrors import is_calibrated
-from rfpose.pipeline.rigid import solve_rigid_poses
+from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
+from rfpose.pipeline.site import SiteOutcome, check_site_solvable, solve_site_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
@@ -69,11 +70,15 @@ def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None =
         check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
     else:
         _check_solvable_by_differences(scenario, chosen)
+    if chosen.pose == "site":
+        check_site_solvable(scenario)
     check_reflectors(scenario, reflectors_of(scenario, chosen.reflection))
 
 
 def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> None:
     """Refuse what cannot do without calibration receivers."""
+    if choice.pose == "site":
+        return
     if choice.pose != "rigid":
         raise ScenarioError(
             f"scenario `{scenario.name}` has no calibration receiver, and pose `{choice.pose}` needs one to learn the "
@@ -142,9 +147,11 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     if not is_calibrated(scenario):
         fixes = replace(fixes, status=np.where(_received(tones).any(axis=2), FixStatus.UNCALIBRATED, fixes.status))
     independent = _pose_table(poses, len(scenario.tone))
-    rigid = None
-    if choice.pose == "rigid":
-        rigid = solve_rigid_poses(
+    found: RigidOutcome | SiteOutcome | None = None
+    if choice.pose == "site":
+        found = solve_site_poses(tones, scenario, independent, sample_rate=rate_of(settings))
+    elif choice.pose == "rigid":
+        found = solve_rigid_poses(
             tones,
             calibration,
             ranges,
@@ -154,7 +161,7 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
             choice,
             sample_rate=rate_of(settings),
         )
-    return Result(
+    result = Result(
         scenario=scenario,
         settings=settings,
         frame_start_index=tones.frame_start_index,
@@ -162,13 +169,12 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         calibration=calibration,
         ranges=ranges,
         fixes=fixes,
-        poses=independent if rigid is None else rigid.poses,
-        integrity=None if rigid is None else rigid.integrity,
-        reflection=None if rigid is None else rigid.reflection,
-        delays=None if rigid is None else rigid.delays,
-        filtered=None if rigid is None else rigid.filtered,
+        poses=independent,
         truth=truth,
     )
+    if found is None:
+        return result
+    return replace(result, **{name: getattr(found, name) for name in found.__dataclass_fields__})
 
 
 def _sides(scenario: Scenario) -> list[Side]:

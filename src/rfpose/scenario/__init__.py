@@ -10,6 +10,7 @@ from rfpose.scenario._reading import load_scenario, naming, parse_scenario, scen
 from rfpose.scenario._scenario import Receiver, Scenario, check_scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
+from rfpose.scenario.multipath import Antenna, Multipath
 from rfpose.scenario.positions import read_positions
 from rfpose.scenario.records import (
     ID_PATTERN,
@@ -35,6 +36,7 @@ __all__ = [
     "MAX_SAMPLE_INDEX",
     "MIN_FRAME_SAMPLES",
     "SPEED_OF_LIGHT_MPS",
+    "Antenna",
     "Blockage",
     "Box",
     "Budget",
@@ -45,6 +47,7 @@ __all__ = [
     "Integrity",
     "Mirror",
     "Motion",
+    "Multipath",
     "Plane",
     "Posture",
     "Radio",

@@ -22,6 +22,7 @@ from rfpose.scenario._scaling import scale_lengths
 from rfpose.scenario._words import in_words
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Reflection
+from rfpose.scenario.multipath import Antenna, Multipath
 from rfpose.scenario.positions import read_positions
 from rfpose.scenario.records import CalibrationReceiver, Heliostat, Radio, Record, Tone, Transmitter
 from rfpose.scenario.simulation import Simulation
@@ -55,6 +56,8 @@ class Scenario(Record):
     simulation: Simulation = Simulation()
     reflection: Reflection = Reflection()
     posture: Posture = Posture()
+    antenna: Antenna = Antenna()
+    multipath: Multipath = Multipath()
     integrity: Integrity = Integrity()
     motion: Motion = Motion()
     budget: Budget = Budget()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
@@ -14,6 +16,78 @@ _ENDED_SIGMAS = 0.2
 _MIN_STEPS = 5
 _FREE = 1e-3
 """Information on what nothing is known of, so that equations stay regular: 30 m, 30 rad."""
+
+
+class Seen(NamedTuple):
+    """`SiteObservations`, and the strength of each transmitter's direct field (mirror, transmitter)."""
+
+    carrier: Any
+    sigma: Any
+    wavenumber: Any
+    unit_field: Any
+
+
+class Heard(NamedTuple):
+    """`Voltages`, ray by ray; ``order`` puts rays of one mirror and ``group`` (factor error) beside each other."""
+
+    first: Any
+    link_of: Any
+    source: Any
+    place: Any
+    extra: Any
+    voltage: Any
+    slope: Any
+    soil_slope: Any
+    vague: Any
+    kind: Any
+    order: Any
+    group: Any
+    amplitude_error: Any
+    phase_error: Any
+    soil_error: Any
+    reference_rot: Any
+
+
+class Prior(NamedTuple):
+    """`SiteKnowledge` as information (1/σ²)."""
+
+    pivot: Any
+    pivot_info: float
+    commanded_rot: Any
+    posture_info: Any
+    roll_info: float
+    clock_info: float
+
+
+class Law(NamedTuple):
+    """How what nothing foresees is distributed, and when a fit ends."""
+
+    floor: float
+    tail: float
+    own_scale: float
+    max_steps: int
+
+
+class Ended(NamedTuple):
+    """What a fit gives, mirror by mirror; ``pivot`` and ``rot`` hold where it begins.
+
+    ``factor`` (mirror, kind, 2) and ``soil`` (mirror, 2, 2): what measurements say of factor errors; of no rows where
+    nobody asks.
+    """
+
+    pivot: Any
+    rot: Any
+    cov: Any
+    weight: Any
+    residual: Any
+    sigma: Any
+    scale: Any
+    total: Any
+    dof: Any
+    cost: Any
+    steps: Any
+    factor: Any
+    soil: Any
 
 
 @kernel
@@ -80,15 +154,16 @@ def forward(lower, n, rhs, n_column):
 
 
 @kernel
-def voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h):
+def voltages(begin, end, heard, k_tx, pivot, rot, moved, part, h, slope_h):
     """What each link receives and its slope with the pose (rotation vector, then pivot).
 
     ``part[k - begin]`` becomes the voltage of ray k. Links are numbered within the mirror.
     """
+    source, place, slope, n_tx = heard.source, heard.place, heard.slope, len(k_tx)
     h[:] = 0.0
     slope_h[:] = 0.0
     for k in range(begin, end):
-        link = link_of[k]
+        link = heard.link_of[k]
         wave = k_tx[link % n_tx]
         y0 = rot[0, 0] * place[k, 0] + rot[0, 1] * place[k, 1] + rot[0, 2] * place[k, 2]
         y1 = rot[1, 0] * place[k, 0] + rot[1, 1] * place[k, 1] + rot[1, 2] * place[k, 2]
@@ -98,9 +173,9 @@ def voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_
         u2 = source[k, 2] - pivot[2] - y2
         length = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
         u0, u1, u2 = u0 / length, u1 / length, u2 / length
-        phase = wave * (length + extra[k])
+        phase = wave * (length + heard.extra[k])
         turned = complex(np.cos(phase), -np.sin(phase))
-        now = voltage[k] + slope[k, 0] * moved[0] + slope[k, 1] * moved[1] + slope[k, 2] * moved[2]
+        now = heard.voltage[k] + slope[k, 0] * moved[0] + slope[k, 1] * moved[1] + slope[k, 2] * moved[2]
         v = now * turned
         part[k - begin] = v
         h[link] += v
@@ -114,8 +189,9 @@ def voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_
 
 
 @kernel
-def add_factor_errors(begin, end, order, group, link_of, amplitude_error, phase_error, part, h, row_of, share, touched, s):
+def add_factor_errors(begin, end, heard, part, h, row_of, share, touched, s):
     """Add to the covariance s what rays' uncertain factors do to phases; rays in order, those of a group together."""
+    order, group, link_of = heard.order, heard.group, heard.link_of
     k = begin
     while k < end:
         now = group[order[k]]
@@ -131,7 +207,7 @@ def add_factor_errors(begin, end, order, group, link_of, amplitude_error, phase_
                 touched[n_touched] = row
                 n_touched += 1
             share[row] += part[ray - begin] / h[link_of[ray]]
-        amp, pha = amplitude_error[first] ** 2, phase_error[first] ** 2
+        amp, pha = heard.amplitude_error[first] ** 2, heard.phase_error[first] ** 2
         for i in range(n_touched):
             a = share[touched[i]]
             for j in range(n_touched):
@@ -142,12 +218,13 @@ def add_factor_errors(begin, end, order, group, link_of, amplitude_error, phase_
 
 
 @kernel
-def add_soil_errors(begin, end, soil_slope, soil_error, link_of, part, h, row_of, share, n, s):
+def add_soil_errors(begin, end, heard, part, h, row_of, share, n, s):
     """Add to the covariance s what the ground's uncertain permittivity, one for all links, does to phases."""
+    soil_error = heard.soil_error
     for k in range(begin, end):
-        row = row_of[link_of[k]]
+        row = row_of[heard.link_of[k]]
         if row >= 0:
-            share[row] += part[k - begin] * soil_slope[k] / h[link_of[k]]
+            share[row] += part[k - begin] * heard.soil_slope[k] / h[heard.link_of[k]]
     for i in range(n):
         a = share[i]
         for j in range(n):
@@ -182,10 +259,27 @@ def tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen):
 
 @kernel
 def tell_factors(
-    begin, end, order, group, kind, link_of, amplitude_error, phase_error, soil_slope, soil_error, part, h, row_of, share,
-    n, own, lower, a, n_par, normal_lower, whitened, seen, z_part, out_factor, out_soil,
-):  # fmt: skip
+    begin,
+    end,
+    heard,
+    part,
+    h,
+    row_of,
+    share,
+    n,
+    own,
+    lower,
+    a,
+    n_par,
+    normal_lower,
+    whitened,
+    seen,
+    z_part,
+    factor,
+    soil,
+):
     """Sum, by kind of ray, what measurements say of factor errors; and of the ground's permittivity."""
+    order, group, kind, link_of = heard.order, heard.group, heard.kind, heard.link_of
     k = begin
     while k < end:
         now = group[order[k]]
@@ -200,26 +294,26 @@ def tell_factors(
         if now < 0:
             continue
         for i in range(n):
-            z_part[i] = amplitude_error[first] * share[i].imag
+            z_part[i] = heard.amplitude_error[first] * share[i].imag
         u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
-        out_factor[kind[first], 0] += u * u
-        out_factor[kind[first], 1] += told
+        factor[kind[first], 0] += u * u
+        factor[kind[first], 1] += told
         for i in range(n):
-            z_part[i] = phase_error[first] * share[i].real
+            z_part[i] = heard.phase_error[first] * share[i].real
         u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
-        out_factor[kind[first], 0] += u * u
-        out_factor[kind[first], 1] += told
+        factor[kind[first], 0] += u * u
+        factor[kind[first], 1] += told
     share[:n] = 0.0
     for k in range(begin, end):
         row = row_of[link_of[k]]
         if row >= 0:
-            share[row] += part[k - begin] * soil_slope[k] / h[link_of[k]]
+            share[row] += part[k - begin] * heard.soil_slope[k] / h[link_of[k]]
     for q in range(2):
         for i in range(n):
-            z_part[i] = soil_error[q] * (share[i].imag if q == 0 else share[i].real)
+            z_part[i] = heard.soil_error[q] * (share[i].imag if q == 0 else share[i].real)
         u, told = tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen)
-        out_soil[q, 0] = u
-        out_soil[q, 1] = told
+        soil[q, 0] = u
+        soil[q, 1] = told
     share[:n] = 0.0
 
 
@@ -230,17 +324,13 @@ def wrapped(x):
 
 
 @kernel_rows
-def fit_mirrors(
-    begin_row, end_row, rows, carrier, sigma, k_tx, unit_field, first, link_of, source, place, extra, voltage, slope,
-    order, group, kind, amplitude_error, phase_error, soil_slope, soil_error, reference_rot, start_pivot, start_rot, surveyed, pivot_info,
-    commanded_rot, posture_info, roll_info, clock_info, floor, nu, own_scale, max_steps,
-    out_pivot, out_rot, out_cov, out_weight, out_residual, out_sigma, out_scale, out_sum, out_dof, out_cost, out_steps, tells, out_factor,
-    out_soil,
-):  # fmt: skip
-    """Fit the pose of each mirror; see ``fit.fit_site`` for arguments, ``out_*`` for what it gives."""
+def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_factor):
+    """Fit the pose of each mirror; see `fit` for the model."""
+    carrier, sigma, k_tx = seen_links.carrier, seen_links.sigma, seen_links.wavenumber
+    first, nu = heard.first, law.tail
     n_rx, n_tx = carrier.shape[1], carrier.shape[2]
     n_link = n_rx * n_tx
-    n_clock = n_rx if np.isfinite(clock_info) else 0
+    n_clock = n_rx if np.isfinite(prior.clock_info) else 0
     n_par = 6 + n_tx + n_clock
     h = np.empty(n_link, np.complex128)
     slope_h = np.empty((n_link, 6), np.complex128)
@@ -272,11 +362,11 @@ def fit_mirrors(
         m = rows[i_row]
         begin, end = first[m * n_link], first[(m + 1) * n_link]
         part = np.empty(max(end - begin, 1), np.complex128)
-        pivot, rot = start_pivot[m].copy(), start_rot[m].copy()
-        out_steps[m] = -1
+        pivot, rot = out.pivot[m].copy(), out.rot[m].copy()
+        out.steps[m] = -1
         # which links are received and foreseen
-        turn_between(rot, reference_rot[m], moved)
-        voltages(begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h)
+        turn_between(rot, heard.reference_rot[m], moved)
+        voltages(begin, end, heard, k_tx, pivot, rot, moved, part, h, slope_h)
         n = 0
         for link in range(n_link):
             c = carrier[m, link // n_tx, link % n_tx]
@@ -293,11 +383,9 @@ def fit_mirrors(
         failed = False
         n_step = 0
         length = np.inf
-        for n_step in range(max_steps):
-            turn_between(rot, reference_rot[m], moved)
-            voltages(
-                begin, end, link_of, source, place, extra, voltage, slope, k_tx, n_tx, pivot, rot, moved, part, h, slope_h
-            )
+        for n_step in range(law.max_steps):
+            turn_between(rot, heard.reference_rot[m], moved)
+            voltages(begin, end, heard, k_tx, pivot, rot, moved, part, h, slope_h)
             # amplitude of each transmitter, so that the floor is relative to its direct field
             gain_a[:], gain_b[:] = 0.0, 0.0
             for i in range(n):
@@ -310,8 +398,9 @@ def fit_mirrors(
                 link = link_at[i]
                 t = link % n_tx
                 r = link // n_tx
-                stray = floor * gain_a[t] / gain_b[t] * unit_field[m, t]
+                stray = law.floor * gain_a[t] / gain_b[t] * seen_links.unit_field[m, t]
                 variance[i] = (sigma[m, r, t] ** 2 + scale * stray**2) / size[i] ** 2
+                variance[i] += heard.vague[m * n_link + link] / abs(h[link]) ** 2
                 residual[i] = np.angle(carrier[m, r, t]) - np.angle(h[link])
                 if n_step == 0:
                     beta[t] += complex(np.cos(residual[i]), np.sin(residual[i])) / variance[i]
@@ -328,10 +417,8 @@ def fit_mirrors(
                 residual[i] = wrapped(residual[i] - np.angle(beta[t]))
                 a[i, n_par] = residual[i]
                 s[i, i] = variance[i] / weight[i]
-            add_factor_errors(
-                begin, end, order, group, link_of, amplitude_error, phase_error, part, h, row_of, share, touched, s
-            )
-            add_soil_errors(begin, end, soil_slope, soil_error, link_of, part, h, row_of, share, n, s)
+            add_factor_errors(begin, end, heard, part, h, row_of, share, touched, s)
+            add_soil_errors(begin, end, heard, part, h, row_of, share, n, s)
             lower[:n, :n] = s[:n, :n]
             if not cholesky(lower, n):
                 failed = True
@@ -349,21 +436,21 @@ def fit_mirrors(
                     t_sum += a[i, p] * a[i, n_par]
                 gradient[p, 0] = t_sum
             # priors: posture, mount, pivot, clocks
-            turn_between(commanded_rot[m], rot, off)
+            turn_between(prior.commanded_rot[m], rot, off)
             for q in range(3):
-                normal[q, q] += posture_info
-                gradient[q, 0] += posture_info * off[q]
-                normal[3 + q, 3 + q] += pivot_info
-                gradient[3 + q, 0] += pivot_info * (surveyed[m, q] - pivot[q])
+                normal[q, q] += prior.posture_info[m]
+                gradient[q, 0] += prior.posture_info[m] * off[q]
+                normal[3 + q, 3 + q] += prior.pivot_info
+                gradient[3 + q, 0] += prior.pivot_info * (prior.pivot[m, q] - pivot[q])
             tilt = (rot[1, 0], -rot[0, 0])  # of the x axis out of the horizontal, by a turn about east and north
             for p in range(2):
-                gradient[p, 0] -= roll_info * tilt[p] * rot[2, 0]
+                gradient[p, 0] -= prior.roll_info * tilt[p] * rot[2, 0]
                 for q in range(2):
-                    normal[p, q] += roll_info * tilt[p] * tilt[q]
+                    normal[p, q] += prior.roll_info * tilt[p] * tilt[q]
             for t in range(n_tx):
                 normal[6 + t, 6 + t] += _FREE
             for r in range(n_clock):
-                normal[6 + n_tx + r, 6 + n_tx + r] += max(clock_info, _FREE)
+                normal[6 + n_tx + r, 6 + n_tx + r] += max(prior.clock_info, _FREE)
             normal_lower[:] = normal
             if not cholesky(normal_lower, n_par):
                 failed = True
@@ -431,20 +518,20 @@ def fit_mirrors(
                 new = (nu + 1.0) / (nu + residual[i] ** 2 / variance[i] + open_part)
                 change = max(change, abs(new - weight[i]))
                 weight[i] = 0.5 * (weight[i] + new)
-            if own_scale > 0.0 and n_step >= 2:
-                new_scale = (own_scale + scale * total) / (own_scale + max(dof, 0.0))
+            if law.own_scale > 0.0 and n_step >= 2:
+                new_scale = (law.own_scale + scale * total) / (law.own_scale + max(dof, 0.0))
                 change = max(change, abs(np.log(new_scale / scale)))
                 scale = np.sqrt(scale * new_scale)
             if n_step >= _MIN_STEPS and length < _SETTLED_SIGMAS**2 and change < _SETTLED_WEIGHT:
                 break
         if failed:
             continue
-        if tells:
-            out_factor[m] = 0.0
+        if n_factor:
+            out.factor[m] = 0.0
             tell_factors(
-                begin, end, order, group, kind, link_of, amplitude_error, phase_error, soil_slope, soil_error, part, h,
-                row_of, share, n, own, lower, a, n_par, normal_lower, whitened, seen, z_part, out_factor[m], out_soil[m],
-            )
+                begin, end, heard, part, h, row_of, share, n, own, lower, a, n_par, normal_lower, whitened, seen,
+                z_part, out.factor[m], out.soil[m],
+            )  # fmt: skip
         cost = 0.0
         for i in range(n):
             cost += (nu + 1.0) * np.log1p(residual[i] ** 2 / (nu * variance[i])) + np.log(variance[i])
@@ -457,15 +544,15 @@ def fit_mirrors(
             quadratic += left * left
             quadratic -= residual[i] * own[i]
         cost += quadratic
-        turn_between(commanded_rot[m], rot, off)
+        turn_between(prior.commanded_rot[m], rot, off)
         for q in range(3):
-            cost += posture_info * off[q] ** 2 + pivot_info * (surveyed[m, q] - pivot[q]) ** 2
-        out_cost[m] = cost
-        out_pivot[m], out_rot[m] = pivot, rot
-        out_scale[m] = scale
-        out_sum[m] = scale * total
-        out_dof[m] = dof
-        out_steps[m] = n_step if length < _ENDED_SIGMAS**2 else max_steps
+            cost += prior.posture_info[m] * off[q] ** 2 + prior.pivot_info * (prior.pivot[m, q] - pivot[q]) ** 2
+        out.cost[m] = cost
+        out.pivot[m], out.rot[m] = pivot, rot
+        out.scale[m] = scale
+        out.total[m] = scale * total
+        out.dof[m] = dof
+        out.steps[m] = n_step if length < _ENDED_SIGMAS**2 else law.max_steps
         for p in range(6):
             gradient[:, 0] = 0.0
             gradient[p, 0] = 1.0
@@ -476,9 +563,9 @@ def fit_mirrors(
                     x -= normal_lower[k, q] * gradient[k, 0]
                 gradient[q, 0] = x / normal_lower[q, q]
             for q in range(6):
-                out_cov[m, q, p] = gradient[q, 0]
+                out.cov[m, q, p] = gradient[q, 0]
         for i in range(n):
             r, t = link_at[i] // n_tx, link_at[i] % n_tx
-            out_weight[m, r, t] = weight[i]
-            out_residual[m, r, t] = residual[i]
-            out_sigma[m, r, t] = np.sqrt(variance[i])
+            out.weight[m, r, t] = weight[i]
+            out.residual[m, r, t] = residual[i]
+            out.sigma[m, r, t] = np.sqrt(variance[i])

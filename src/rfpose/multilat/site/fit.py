@@ -66,6 +66,8 @@ _LEAST_SOIL_SIGMA = 0.01
 """Relative; no ground is of one permittivity all over."""
 _AMBIGUOUS_COST = 9.0
 """Two poses apart whose costs (twice the log likelihood) differ by less may each be the true one."""
+_APART = 0.15
+"""Poses whose normals differ by more than this part of a wavelength over the lever are not the same."""
 _TELLING = 3
 """Fewer links than this beyond those that a pose takes confirm none."""
 
@@ -112,7 +114,7 @@ class SiteKnowledge:
         In each axis [m].
     commanded_rot : (mirror, 3, 3)
         Orientation that control commanded, to ENU from the mirror frame; NaN: unknown.
-    posture_sigma_rad
+    posture_sigma_rad : (mirror,)
         How far orientations are from that, about each axis [rad]; infinity: it is where to begin, and no more.
     roll_sigma_rad
         How well a mount holds the x axis horizontal [rad]; infinity: no such mount.
@@ -127,7 +129,7 @@ class SiteKnowledge:
     pivot_enu_m: FloatArray
     pivot_sigma_m: float
     commanded_rot: FloatArray
-    posture_sigma_rad: float
+    posture_sigma_rad: FloatArray
     roll_sigma_rad: float
     clock_sigma_m: float
     unit_field: FloatArray
@@ -147,6 +149,8 @@ class Voltages:
     soil_slope : (ray,)
         Relative change of the voltage by a relative change of the ground's complex permittivity; zero for rays that the
         ground did not turn.
+    vague : (link,)
+        Variance of the real part of what each link receives because the antenna's response is not known well.
     reference_rot : (mirror, 3, 3)
         The orientation they hold for.
     """
@@ -155,6 +159,7 @@ class Voltages:
     voltage: ComplexArray
     slope: ComplexArray
     soil_slope: ComplexArray
+    vague: FloatArray
     reference_rot: FloatArray
 
 
@@ -186,7 +191,7 @@ class SiteSettings:
     factor_sigma
         By `RayKind`: standard deviation of foreseen rays' factors, relative amplitude and phase [rad].
     soil_sigma
-        Relative standard deviation of the ground's complex permittivity, real and imaginary part of its relative change.
+        Standard deviation of the relative change of the ground's complex permittivity, real and imaginary part.
     missed_detection
         Risk at which protection levels are exceeded.
     rounds
@@ -308,9 +313,14 @@ def fit_site(
     fit = _Fit(observations, knowledge, chosen)
     given = Common(
         floor=_FIRST_FLOOR if chosen.floor is None else chosen.floor,
-        tail=_TAILS[0] if chosen.tail is None else chosen.tail, factor_scale=np.ones(len(RayKind)), soil_change=0j, soil_sigma=chosen.soil_sigma,
-    )  # fmt: skip
-    known = np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
+        tail=_TAILS[0] if chosen.tail is None else chosen.tail,
+        factor_scale=np.ones(len(RayKind)),
+        soil_change=0j,
+        soil_sigma=chosen.soil_sigma,
+    )
+    known = np.asarray(
+        np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
+    )
     state = _State.begin(knowledge)
     common = given
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
@@ -340,7 +350,7 @@ def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float)
     wavelength_m
         Of the carrier [m].
     """
-    reach = 2.5 * posture_sigma_rad if np.isfinite(posture_sigma_rad) else 0.0
+    reach = 2.5 * posture_sigma_rad
     step = wavelength_m / 3.0 / lever_m
     n = min(int(np.ceil(max(reach / step - 0.5, 0.0))), 3)
     axis = step * np.arange(-n, n + 1)
@@ -350,9 +360,9 @@ def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float)
     return np.asarray(turns[np.argsort(np.linalg.norm(turns, axis=1), kind="stable")])
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _State:
-    """Where the fit of each mirror stands."""
+    """Where the fit of each mirror stands; arrays as the kernel gives them, pose covariance in turn, then pivot."""
 
     pivot: FloatArray
     rot: FloatArray
@@ -366,29 +376,28 @@ class _State:
     cost: FloatArray
     steps: IntArray
     ambiguous: BoolArray
-    shape: tuple[int, int, int] = (0, 0, 0)
 
     @classmethod
     def begin(cls, known: SiteKnowledge) -> _State:
+        """Return mirrors as commanded, of which nothing is found yet."""
         n, n_rx = known.receiver_mirror_m.shape[:2]
-        shape = (n, n_rx, known.unit_field.shape[1])
-        return cls.empty(shape, known.pivot_enu_m.copy(), known.commanded_rot.copy())
-
-    @classmethod
-    def empty(cls, shape: tuple[int, int, int], pivot: FloatArray, rot: FloatArray) -> _State:
-        n = shape[0]
-
-        def row() -> FloatArray:
-            return np.full(n, np.nan)
-
-        def link() -> FloatArray:
-            return np.full(shape, np.nan)
-
+        link = (n, n_rx, known.unit_field.shape[1])
+        row, links = np.full(n, np.nan), np.full(link, np.nan)
         return cls(
-            pivot=pivot, rot=rot, cov=np.full((n, 6, 6), np.nan), weight=link(), residual=link(), sigma=link(),
-            scale=np.ones(n), total=row(), dof=row(), cost=row(), steps=np.full(n, -1, np.int64),
-            ambiguous=np.zeros(n, np.bool_), shape=shape,
+            pivot=known.pivot_enu_m.copy(), rot=known.commanded_rot.copy(), cov=np.full((n, 6, 6), np.nan),
+            weight=links.copy(), residual=links.copy(), sigma=links.copy(), scale=np.ones(n), total=row.copy(),
+            dof=row.copy(), cost=row.copy(), steps=np.full(n, -1, np.int64), ambiguous=np.zeros(n, np.bool_),
         )  # fmt: skip
+
+    def copy(self) -> _State:
+        """Return one that may be written into."""
+        return _State(*(getattr(self, name).copy() for name in _State.__dataclass_fields__))
+
+    def with_poses_of(self, other: _State, rows: BoolArray) -> _State:
+        """Return this with some mirrors where the other has them."""
+        out = self.copy()
+        out.pivot[rows], out.rot[rows] = other.pivot[rows], other.rot[rows]
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,35 +428,66 @@ class _Fit:
     def __init__(self, observations: SiteObservations, knowledge: SiteKnowledge, settings: SiteSettings) -> None:
         n, n_rx, n_tx = observations.carrier.shape
         if knowledge.receiver_mirror_m.shape != (n, n_rx, 3) or knowledge.unit_field.shape != (n, n_tx):
-            raise InvalidInputError("`observations` and `knowledge` are not of the same mirrors, receivers, transmitters")
+            raise InvalidInputError(
+                "`observations` and `knowledge` are not of the same mirrors, receivers, transmitters"
+            )
         self.seen, self.known, self.settings = observations, knowledge, settings
-
-    def run(self, voltages: Voltages, state: _State, rows: IntArray, common: Common, told: _Told | None = None) -> _State:
-        """Fit some mirrors from where they stand; the others stay."""
-        seen, known, chosen, rays = self.seen, self.known, self.settings, voltages.rays
-        out = replace(state)
-        fresh = _State.empty(state.shape, state.pivot.copy(), state.rot.copy())
-        order, group, amplitude, phase, link_of = _grouped(
-            rays, seen.carrier.shape, chosen.factor_sigma, common.factor_scale
+        self._own_scale = 0.0 if np.isinf(settings.own_scale) else settings.own_scale
+        self._links = _kernels.Seen(
+            np.ascontiguousarray(observations.carrier, np.complex128),
+            np.ascontiguousarray(observations.sigma, np.float64),
+            np.ascontiguousarray(observations.wavenumber_radpm, np.float64),
+            np.ascontiguousarray(knowledge.unit_field, np.float64),
         )
-        told = _Told.of(0) if told is None else told
         with np.errstate(divide="ignore"):
-            info = [np.float64(s) ** -2.0 for s in (known.pivot_sigma_m, known.posture_sigma_rad, known.roll_sigma_rad)]
-            clock_info = np.float64(known.clock_sigma_m) ** -2.0
+            pivot_info, roll_info, clock_info = (
+                float(np.float64(sigma) ** -2.0)
+                for sigma in (knowledge.pivot_sigma_m, knowledge.roll_sigma_rad, knowledge.clock_sigma_m)
+            )
+        self._prior = _kernels.Prior(
+            pivot=np.ascontiguousarray(knowledge.pivot_enu_m),
+            pivot_info=pivot_info,
+            commanded_rot=np.ascontiguousarray(knowledge.commanded_rot),
+            posture_info=np.ascontiguousarray(knowledge.posture_sigma_rad**-2.0),
+            roll_info=roll_info,
+            clock_info=clock_info,
+        )
+
+    def run(
+        self, voltages: Voltages, state: _State, rows: IntArray, common: Common, told: _Told | None = None
+    ) -> _State:
+        """Fit some mirrors from where they stand; the others stay."""
+        out = state.copy()
+        out.scale[rows] = 1.0
+        for values in (out.weight, out.residual, out.sigma):
+            values[rows] = np.nan
+        told = _Told.of(0) if told is None else told
         _kernels.fit_mirrors(
-            len(rows), rows, seen.carrier, seen.sigma, seen.wavenumber_radpm, known.unit_field, rays.first, link_of,
-            rays.source_enu_m, rays.place_mirror_m, rays.extra_m, voltages.voltage, voltages.slope, order, group,
-            rays.kind, amplitude, phase, voltages.soil_slope, np.array(common.soil_sigma), voltages.reference_rot, state.pivot, state.rot, known.pivot_enu_m, float(info[0]),
-            known.commanded_rot, float(info[1]), float(info[2]), float(clock_info), common.floor, common.tail,
-            0.0 if np.isinf(chosen.own_scale) else chosen.own_scale, _MAX_STEPS,
-            fresh.pivot, fresh.rot, fresh.cov, fresh.weight, fresh.residual, fresh.sigma, fresh.scale, fresh.total,
-            fresh.dof, fresh.cost, fresh.steps, len(told.factor) > 0, told.factor, told.soil,
+            len(rows),
+            rows,
+            self._links,
+            self._heard(voltages, common),
+            self._prior,
+            _kernels.Law(common.floor, common.tail, self._own_scale, _MAX_STEPS),
+            _kernels.Ended(
+                out.pivot, out.rot, out.cov, out.weight, out.residual, out.sigma, out.scale, out.total, out.dof,
+                out.cost, out.steps, told.factor, told.soil,
+            ),
+            len(told.factor),
         )  # fmt: skip
-        for name in ("pivot", "rot", "cov", "weight", "residual", "sigma", "scale", "total", "dof", "cost", "steps"):
-            values = getattr(state, name).copy()
-            values[rows] = getattr(fresh, name)[rows]
-            setattr(out, name, values)
         return out
+
+    def _heard(self, voltages: Voltages, common: Common) -> _kernels.Heard:
+        rays = voltages.rays
+        order, group, amplitude, phase, link_of = _grouped(
+            rays, self.seen.carrier.shape, self.settings.factor_sigma, common.factor_scale
+        )
+        return _kernels.Heard(
+            first=rays.first, link_of=link_of, source=rays.source_enu_m, place=rays.place_mirror_m, extra=rays.extra_m,
+            voltage=voltages.voltage, slope=voltages.slope, soil_slope=voltages.soil_slope, vague=voltages.vague,
+            kind=rays.kind, order=order, group=group, amplitude_error=amplitude, phase_error=phase,
+            soil_error=np.array(common.soil_sigma), reference_rot=voltages.reference_rot,
+        )  # fmt: skip
 
     def learn(self, voltages: Voltages, state: _State, known: BoolArray, common: Common) -> Common:
         """Return what all mirrors' residuals say of what they have in common (restricted maximum likelihood)."""
@@ -462,9 +502,7 @@ class _Fit:
             best, chosen = cost, found
         return common if np.isinf(best) else chosen
 
-    def _learn_with(
-        self, voltages: Voltages, state: _State, rows: IntArray, common: Common
-    ) -> tuple[float, Common]:
+    def _learn_with(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
         given = common
         told = _Told.of(len(state.cost))
         for _ in range(_LEARN_ROUNDS):
@@ -512,13 +550,15 @@ class _Fit:
         status = np.full(len(known), PoseStatus.OK, np.int64)
         poses = SitePoses(
             pivot_enu_m=state.pivot, rot_enu_from_mirror=state.rot, cov=cov, weight=state.weight,
-            residual_rad=state.residual, sigma_rad=state.sigma, floor=common.floor * np.sqrt(state.scale), dof=state.dof,
-            protection_level_rad=np.full(len(known), np.nan), status=status, common=common,
+            residual_rad=state.residual, sigma_rad=state.sigma, floor=common.floor * np.sqrt(state.scale),
+            dof=state.dof, protection_level_rad=np.full(len(known), np.nan), status=status, common=common,
         )  # fmt: skip
         normal_cov = poses.normal_cov
         sigma = np.sqrt(np.trace(normal_cov, axis1=1, axis2=2))
         worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(normal_cov))[:, -1])
-        freedom = np.fmax(np.nan_to_num(state.dof), 1.0) + (0.0 if np.isinf(self.settings.own_scale) else self.settings.own_scale)
+        freedom = np.fmax(np.nan_to_num(state.dof), 1.0) + (
+            0.0 if np.isinf(self.settings.own_scale) else self.settings.own_scale
+        )
         level = worst * np.sqrt(2.0 * fdtri(2.0, freedom, 1.0 - self.settings.missed_detection))
         status[~(sigma <= MAX_SIGMA_RAD)] = PoseStatus.UNCERTAIN
         status[state.ambiguous] = PoseStatus.AMBIGUOUS
@@ -543,33 +583,27 @@ def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray
     knowledge = fit.known
     lever = float(np.nanmax(np.linalg.norm(knowledge.receiver_mirror_m, axis=-1), initial=0.0))
     wavelength = 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
-    turns = spread_starts(knowledge.posture_sigma_rad, max(lever, 1e-9), wavelength)[1:]
+    finite = knowledge.posture_sigma_rad[np.isfinite(knowledge.posture_sigma_rad)]
+    turns = spread_starts(float(finite.max(initial=0.0)), max(lever, 1e-9), wavelength)[1:]
     rows = np.flatnonzero(known)
     if not len(turns) or not len(rows):
         return state
-    apart = 0.5 * wavelength / lever / 3.0
     near = field_at(knowledge.pivot_enu_m, knowledge.commanded_rot, common.soil_change)
+    turned = np.empty((3, 3))
     for w in turns:
-        turned = np.empty((3, 3))
         _kernels.turn(w, turned)
-        start = replace(state, pivot=knowledge.pivot_enu_m.copy(), rot=turned @ knowledge.commanded_rot)
+        start = replace(state, pivot=knowledge.pivot_enu_m, rot=turned @ knowledge.commanded_rot)
         found = fit.run(near, start, rows, common)
         off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
         ended = (found.steps > 0) & (found.steps < _MAX_STEPS)
-        first = ended & ~(state.steps > 0)
-        other = ended & (off > apart)
-        better = first | (other & (found.cost < state.cost))
-        gap = np.abs(found.cost - state.cost)
-        state.ambiguous = np.where(better, gap < _AMBIGUOUS_COST, state.ambiguous | (other & (gap < _AMBIGUOUS_COST)))
+        other = ended & (off > _APART * wavelength / lever)
+        better = (ended & ~(state.steps > 0)) | (other & (found.cost < state.cost))
+        alike = np.abs(found.cost - state.cost) < _AMBIGUOUS_COST
+        ambiguous = np.where(better, alike, state.ambiguous) | (other & alike)
         if better.any():
-            for name in ("pivot", "rot"):
-                values = getattr(state, name).copy()
-                values[better] = getattr(found, name)[better]
-                setattr(state, name, values)
-            again = np.flatnonzero(better)
-            ambiguous = state.ambiguous
-            state = fit.run(field_at(state.pivot, state.rot, common.soil_change), state, again, common)
-            state.ambiguous = ambiguous
+            moved = state.with_poses_of(found, better)
+            state = fit.run(field_at(moved.pivot, moved.rot, common.soil_change), moved, np.flatnonzero(better), common)
+        state = replace(state, ambiguous=ambiguous)
     return state
 
 

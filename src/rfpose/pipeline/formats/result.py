@@ -38,6 +38,7 @@ __all__ = [
     "PoseTable",
     "ReflectionTable",
     "Result",
+    "SiteTable",
     "StatusArray",
     "frame_time",
     "rate_of",
@@ -176,6 +177,38 @@ class ReflectionTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SiteTable:
+    """What pose ``site`` found besides poses.
+
+    Attributes
+    ----------
+    weight : (frame, receiver, transmitter)
+        What each link counts, beside one without surprises; NaN: not used.
+    residual_rad, sigma_rad : (frame, receiver, transmitter)
+        Phase that neither pose nor foreseen rays explain, and its expected standard deviation [rad].
+    floor : (frame, heliostat)
+        Strength of the field that nothing foresees, relative to the direct one.
+    tail : (heliostat,)
+        Degrees of freedom of its distribution, Student's t.
+    factor_scale : (heliostat, ray kind)
+        How large errors of foreseen rays' factors are beside what ``[multipath]`` says.
+    permittivity_change : (heliostat,)
+        Relative change of the ground's complex permittivity against the scenario's.
+    permittivity_sigma : (heliostat, 2)
+        Its standard deviation, real and imaginary part.
+    """
+
+    weight: FloatArray
+    residual_rad: FloatArray
+    sigma_rad: FloatArray
+    floor: FloatArray
+    tail: FloatArray
+    factor_scale: FloatArray
+    permittivity_change: npt.NDArray[np.complex128]
+    permittivity_sigma: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DelayTable:
     """Delays between a mirror's receivers, learned over frames.
 
@@ -235,7 +268,7 @@ class Result(Shown):
         First sample of each frame, counted from the Unix epoch at the recording's sample rate.
     tones, calibration, ranges, fixes, poses
         The stages in order.
-    integrity, reflection, delays, filtered
+    integrity, reflection, site, delays, filtered
         What else the chosen estimator of poses found; None where it does not look for it.
     truth
         What was really there, copied from a simulated recording; else None.
@@ -251,6 +284,7 @@ class Result(Shown):
     poses: PoseTable
     integrity: IntegrityTable | None = None
     reflection: ReflectionTable | None = None
+    site: SiteTable | None = None
     delays: DelayTable | None = None
     filtered: FilteredTable | None = None
     truth: Truth | None = None

@@ -45,8 +45,10 @@ from rfpose.pipeline.formats.result import (
     PoseTable,
     ReflectionTable,
     Result,
+    SiteTable,
     rate_of,
 )
+from rfpose.propagation import RayKind
 from rfpose.recording.hdf5 import find_item
 from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario
 from rfpose.truth import Truth
@@ -148,6 +150,16 @@ KEYS: Mapping[str, Column] = {
     "reflection/probability_direct": Column(
         _FH, "f8", "1", "of residuals so large by chance, with the direct ray alone"
     ),
+    "site/weight": Column(_FRT, "f8", "1", "what the link counts, beside one without surprises"),
+    "site/residual_rad": Column(_FRT, "f8", "rad", "phase that neither pose nor foreseen rays explain"),
+    "site/sigma_rad": Column(_FRT, "f8", "rad", "its expected standard deviation"),
+    "site/floor": Column(_FH, "f8", "1", "field that nothing foresees, relative to the direct one"),
+    "site/tail": Column(("heliostat",), "f8", "1", "degrees of freedom of its distribution, Student's t"),
+    "site/factor_scale": Column(("heliostat", "ray_kind"), "f8", "1", "errors of rays' factors over the stated"),
+    "site/permittivity_change": Column(
+        ("heliostat",), "c16", "1", "relative change of the ground's complex permittivity against the scenario's"
+    ),
+    "site/permittivity_sigma": Column(("heliostat", "part"), "f8", "1", "of its real and imaginary part"),
     "delays/delay_s": Column((*_FR, "clock"), "f8", "s", "delay less that of the mirror's first receiver"),
     "delays/sigma_s": Column((*_FR, "clock"), "f8", "s", "its standard deviation"),
     "delays/jumped": Column(_FH, "?", "1", "a delay had jumped and was learned anew"),
@@ -170,6 +182,7 @@ KEYS: Mapping[str, Column] = {
 OPTIONAL: Mapping[str, type[Any]] = {
     "integrity": IntegrityTable,
     "reflection": ReflectionTable,
+    "site": SiteTable,
     "delays": DelayTable,
     "filtered": FilteredTable,
 }
@@ -259,6 +272,7 @@ def labels_of(result: Result) -> Labels:
         "clock": text_label(clocks[: result.poses.integer_method.shape[-1]], "wavelength, the coarsest first"),
         "prior": text_label(PRIORS, "what is known beforehand"),
         "reflector": text_label(("ground", *(p.name for p in scenario.reflection.plane)), "what reflects"),
+        "ray_kind": text_label([kind.name.lower() for kind in RayKind], "what a foreseen ray met"),
         "truth_frame": (np.arange(n_truth), {"long_name": "frame of the truth"})
         if truth_start is None
         else instants(truth_start, "from when on the truth holds, UTC"),
@@ -305,6 +319,7 @@ class _Reader(FileReader):
             "transmitter": len(scenario.transmitter_ids),
             "tone": len(scenario.tone_hz),
             "heliostat": len(scenario.heliostat_ids),
+            "ray_kind": len(RayKind),
         }
         settings = self._settings(scenario)
         start_index = self._start_index(Fraction(settings["sample_rate"]))

@@ -1,0 +1,274 @@
+"""What the antennas of a group of mirrors would receive in given poses: foreseen rays, weighed by the antennas."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose import geometry
+from rfpose.antenna import AntennaPattern, PatternTable, dipole_pattern, grid_directions
+from rfpose.checks import FloatArray
+from rfpose.errors import ScenarioError
+from rfpose.multilat.site import Voltages
+from rfpose.pipeline.formats.antenna_file import read_pattern
+from rfpose.pipeline.mirrors import MirrorGroup
+from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, foresee
+from rfpose.propagation.site import place_things
+from rfpose.scenario import Scenario
+
+__all__ = ["ReceivingAntenna", "SiteField", "antenna_of"]
+
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+
+_log = logging.getLogger(__name__)
+
+_VACUUM_PERMITTIVITY = 8.8541878128e-12
+_SOIL_STEP = 1e-3
+"""Relative change of the permittivity by which rays' slope with it is found."""
+_SAME_PLACE_M = 0.05
+"""A pattern's receivers may be this far from the scenario's."""
+
+
+class ReceivingAntenna(Protocol):
+    """What the receivers of a mirror make of waves."""
+
+    @property
+    def strength(self) -> float:
+        """Voltage of a unit field, over all directions, rms."""
+
+    @property
+    def holds_own_plate(self) -> bool:
+        """Whether what the mirror's own plate does is in it already."""
+
+    def receive(
+        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """Return voltages (ray,), their slopes by a turn of the mirror (ray, xyz) and their errors (ray,).
+
+        Parameters
+        ----------
+        field_enu : (ray, xyz)
+        towards_enu : (ray, xyz)
+            Unit vectors from the receiver to where the ray comes from.
+        rot : (ray, 3, 3)
+            Orientation of the mirror, to ENU from the mirror frame.
+        receiver : (ray,)
+            Of the mirror.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class VerticalAntenna:
+    """Answers alike to vertically polarised waves from all directions, however the mirror stands."""
+
+    @property
+    def strength(self) -> float:
+        """See `ReceivingAntenna`."""
+        return 1.0
+
+    @property
+    def holds_own_plate(self) -> bool:
+        """See `ReceivingAntenna`."""
+        return False
+
+    def receive(
+        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """See `ReceivingAntenna`."""
+        voltage = (field_enu * _theta_hat(towards_enu)).sum(axis=1)
+        return voltage, np.zeros((len(voltage), 3), np.complex128), np.zeros(len(voltage))
+
+
+@dataclass(frozen=True, slots=True)
+class PatternAntenna:
+    """Answers as a table says, fixed to the mirror."""
+
+    table: PatternTable
+    strength: float
+    holds_own_plate: bool
+
+    @classmethod
+    def of(cls, pattern: AntennaPattern, frequency_hz: float, *, holds_own_plate: bool) -> PatternAntenna:
+        """Return the antenna at one frequency."""
+        table = pattern.table(frequency_hz)
+        n_polar = 19
+        towards = grid_directions(n_polar, 36).reshape(-1, 3)
+        weight = np.repeat(np.sin(np.linspace(0.0, np.pi, n_polar)), 36)
+        power = [
+            (np.abs(table.vector(towards, r)) ** 2).sum(axis=1) @ weight / weight.sum() for r in range(table.n_receiver)
+        ]
+        return cls(table, float(np.sqrt(0.5 * np.mean(power))), holds_own_plate)
+
+    def receive(
+        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """See `ReceivingAntenna`."""
+        field = np.einsum("kba,kb->ka", rot, field_enu)
+        towards = np.einsum("kba,kb->ka", rot, towards_enu)
+        vector, slope, sigma = self.table.vector_and_slope(towards, receiver)
+        out = np.empty((len(field), 3), np.complex128)
+        for q, axis in enumerate(np.eye(3)):
+            # the world turns the other way about the mirror: x in the mirror's frame changes by Rᵀ (x × axis)
+            turned_field = np.einsum("kba,kb->ka", rot, np.cross(field_enu, axis))
+            turned_towards = np.einsum("kba,kb->ka", rot, np.cross(towards_enu, axis))
+            out[:, q] = (turned_field * vector).sum(axis=1)
+            out[:, q] += np.einsum("ka,kab,kb->k", field, slope, turned_towards)
+        return (field * vector).sum(axis=1), out, sigma * np.linalg.norm(field, axis=1)
+
+
+def antenna_of(scenario: Scenario) -> ReceivingAntenna:
+    """Return the antennas of a scenario's mirrors, from ``[antenna]``.
+
+    Raises
+    ------
+    ScenarioError
+        A pattern of other receivers than the scenario's.
+    RecordingError
+        The pattern's file is missing or damaged.
+    """
+    table = scenario.antenna
+    frequency_hz = float(scenario.carrier_rf_hz.mean())
+    places = np.array(scenario.heliostat[0].receiver_mirror_m)
+    if table.pattern is not None:
+        pattern = read_pattern(table.pattern).pattern
+        if pattern.n_receiver != len(places) or np.abs(pattern.receiver_mirror_m - places).max() > _SAME_PLACE_M:
+            raise ScenarioError(
+                f"{table.pattern}: is of receivers at {pattern.receiver_mirror_m.round(3).tolist()} m on the mirror, "
+                f"and those of scenario `{scenario.name}` are at {places.round(3).tolist()}; give the pattern of this "
+                "mirror"
+            )
+        return PatternAntenna.of(pattern, frequency_hz, holds_own_plate=True)
+    if table.receiver == "dipole":
+        pattern = dipole_pattern(places, table.axis_mirror, frequency_hz)
+        return PatternAntenna.of(pattern, frequency_hz, holds_own_plate=False)
+    return VerticalAntenna()
+
+
+class SiteField:
+    """Rays and voltages of a group of mirrors, all frames, for `rfpose.multilat.site.fit_site`."""
+
+    def __init__(
+        self, scenario: Scenario, group: MirrorGroup, commanded_rot: FloatArray, antenna: ReceivingAntenna
+    ) -> None:
+        """Take the orientations that were commanded (frame, mirror, 3, 3), mirrors as `Scenario.mirrors` has them."""
+        self._scenario, self._group, self._antenna = scenario, group, antenna
+        self._commanded = commanded_rot
+        table = scenario.multipath
+        self._options = Foresight(
+            visibility=table.visibility,
+            ground="ground" in table.foresee,
+            specular="specular" in table.foresee,
+            own_plate="own_plate" in table.foresee and not antenna.holds_own_plate,
+            reach_m=table.reach_m,
+            antenna=scenario.antenna.transmitter,
+            propagation_speed_mps=scenario.radio.propagation_speed_mps,
+        )
+
+    def __call__(self, pivot_enu_m: FloatArray, rot: FloatArray, soil_change: complex) -> Voltages:
+        """Return what the mirrors would receive; the first axis is frame × heliostat of the group."""
+        n_frame, n_helio = len(self._commanded), len(self._group.column)
+        pivot = pivot_enu_m.reshape(n_frame, n_helio, 3)
+        turned = rot.reshape(n_frame, n_helio, 3, 3)
+        parts = [self._frame(pivot[f], turned[f], self._commanded[f], soil_change) for f in range(n_frame)]
+        return _joined(parts)
+
+    def _frame(self, pivot: FloatArray, rot: FloatArray, commanded: FloatArray, soil_change: complex) -> Voltages:
+        scenario, group = self._scenario, self._group
+        standing = commanded.copy()
+        known = np.isfinite(rot).all(axis=(1, 2))
+        standing[group.column[known]] = rot[known]
+        found = place_things(scenario, standing)
+        stand = Stand(
+            pivot_enu_m=pivot,
+            rot_enu_from_mirror=rot,
+            receiver_mirror_m=group.places_m,
+            own_plate=found.own_plate[group.column],
+        )
+        things = _with_soil(found.surroundings, soil_change, scenario)
+        rays = self._rays(stand, things)
+        receiver = _receivers(rays, group.places_m.shape[1], len(scenario.transmitter))
+        mirror = _mirrors(rays, group.places_m.shape[1] * len(scenario.transmitter))
+        at = pivot[mirror] + np.einsum("kab,kb->ka", rot[mirror], rays.place_mirror_m)
+        towards = geometry.unit(rays.source_enu_m - at) if rays.n_ray else rays.source_enu_m
+        voltage, slope, error = self._antenna.receive(rays.field_enu, towards, rot[mirror], receiver)
+        link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+        vague = np.zeros(len(rays.first) - 1)
+        np.add.at(vague, link, error**2)
+        return Voltages(
+            rays=rays, voltage=voltage, slope=slope, soil_slope=self._soil_slope(stand, things, rays), vague=vague,
+            reference_rot=rot,
+        )  # fmt: skip
+
+    def _rays(self, stand: Stand, things: Surroundings) -> Rays:
+        scenario = self._scenario
+        return foresee(scenario.transmitter_enu_m, scenario.carrier_rf_hz, stand, things, self._options)
+
+    def _soil_slope(self, stand: Stand, things: Surroundings, rays: Rays) -> ComplexArray:
+        """Relative change of rays' fields by a relative change of the ground's complex permittivity."""
+        out = np.zeros(rays.n_ray, np.complex128)
+        if things.soil is None or not self._options.ground:
+            return out
+        other = self._rays(stand, _with_soil(things, complex(_SOIL_STEP), self._scenario))
+        if other.n_ray != rays.n_ray or not np.array_equal(other.kind, rays.kind):
+            # a ray on the verge of being too faint: its mirrors do without
+            return out
+        strongest = np.argmax(np.abs(rays.field_enu), axis=1)
+        k = np.arange(rays.n_ray)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            change = other.field_enu[k, strongest] / rays.field_enu[k, strongest] - 1.0
+        return np.where(np.isfinite(change), change / _SOIL_STEP, 0.0)
+
+
+def _with_soil(things: Surroundings, change: complex, scenario: Scenario) -> Surroundings:
+    """Return surroundings whose ground has another permittivity, by a relative change of the complex one."""
+    soil = things.soil
+    if soil is None or change == 0j:
+        return things
+    omega_eps = 2.0 * np.pi * float(scenario.carrier_rf_hz.mean()) * _VACUUM_PERMITTIVITY
+    value = complex(soil.permittivity, -soil.conductivity_s_per_m / omega_eps) * (1.0 + change)
+    return replace(
+        things,
+        soil=Soil(
+            permittivity=max(value.real, 1.0),
+            conductivity_s_per_m=max(-value.imag * omega_eps, 0.0),
+            height_m=soil.height_m,
+            normal_enu=soil.normal_enu,
+        ),
+    )
+
+
+def _mirrors(rays: Rays, n_link: int) -> IntArray:
+    return np.repeat(np.arange(len(rays.first) - 1) // n_link, np.diff(rays.first))
+
+
+def _receivers(rays: Rays, n_receiver: int, n_transmitter: int) -> IntArray:
+    return np.repeat(np.arange(len(rays.first) - 1) // n_transmitter % n_receiver, np.diff(rays.first))
+
+
+def _joined(parts: list[Voltages]) -> Voltages:
+    """Put the rays of several frames one after the other."""
+    rays = [part.rays for part in parts]
+    offset = np.cumsum([0, *(r.n_ray for r in rays)])
+    first = [rays[0].first[:1], *(r.first[1:] + o for r, o in zip(rays, offset[:-1], strict=True))]
+    names = ("source_enu_m", "place_mirror_m", "extra_m", "field_enu", "kind", "thing")
+    return Voltages(
+        rays=Rays(
+            first=np.concatenate(first), **{name: np.concatenate([getattr(r, name) for r in rays]) for name in names}
+        ),
+        **{
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("voltage", "slope", "soil_slope", "vague", "reference_rot")
+        },
+    )
+
+
+def _theta_hat(towards: FloatArray) -> FloatArray:
+    """(ray, xyz) unit vectors of vertical polarisation, downward for what comes from the horizon."""
+    across = np.maximum(np.hypot(towards[:, 0], towards[:, 1]), 1e-12)[:, None]
+    up = towards[:, 2:]
+    return np.concatenate([up * towards[:, :2] / across, -across], axis=1)
