@@ -19,7 +19,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from rfpose import geometry
 from rfpose.dsp import TonePhases
 from rfpose.errors import RfposeError
 from rfpose.multilat import PoseStatus
+from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario
@@ -72,7 +73,7 @@ class Folders:
 
     def pattern(self, place: str, mhz: float) -> Path | None:
         """Return the file of an antenna pattern; None where there is none."""
-        path = None if self.patterns is None else self.patterns / f"{place}_y_{mhz:.0f}MHz.npz"
+        path = None if self.patterns is None else self.patterns / f"{place}_y_{mhz:.0f}MHz.h5"
         return path if path is not None and path.exists() else None
 
 
@@ -297,7 +298,7 @@ def _lines(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -
     pattern = folders.pattern(spec.place, spec.mhz)
     if pattern is None:
         return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
-    return f"patterns are not read yet: {pattern}"
+    return lines_of(site, table, traced.antenna_before_plate(site, table, rot, read_pattern(pattern).pattern))
 
 
 def _table(spec: Spec, folders: Folders, sun: int) -> Table | str:
@@ -319,6 +320,8 @@ def _table(spec: Spec, folders: Folders, sun: int) -> Table | str:
 def _lines_by_moments(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -> Complex | str:
     """Return the lines of direct rays alone, received before the mirror's own plate."""
     path = folders.moments(spec.place, spec.mhz)
+    if path is None and folders.pattern(spec.place, spec.mhz) is not None:
+        return _lines(replace(spec, variant="direct"), folders, site, sun, rot)
     if path is None:
         return f"no responses {spec.place}_y_{spec.mhz:.0f}MHz"
     with np.load(path, allow_pickle=False) as file:

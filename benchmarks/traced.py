@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose import geometry
+from rfpose.antenna import AntennaPattern
 from rfpose.dsp import LineStatus, TonePhases
 from rfpose.scenario import Scenario, parse_scenario
 
@@ -253,16 +254,36 @@ def antenna_short_dipole(table: Table, rot_enu_from_mirror: Array) -> Complex:
     return -np.einsum("kx,kx->k", table.field_enu(), axis[table.rx])
 
 
+def antenna_before_plate(site: Scenario, table: Table, rot_enu_from_mirror: Array, pattern: AntennaPattern) -> Complex:
+    """Return (ray, line) what a mirror's receivers make of rays; calibration receivers are isotropic."""
+    owner = np.array([-1 if r.heliostat is None else r.heliostat for r in site.receivers])[table.rx]
+    first = np.array([site.receiver_rows(i).start for i in range(len(site.heliostat))])
+    mirror = np.flatnonzero(owner >= 0)
+    rot, own = rot_enu_from_mirror[owner[mirror]], table.rx[mirror] - first[owner[mirror]]
+    toward = np.einsum("kx,kxm->km", table.direction_enu()[mirror], rot)
+    field = np.einsum("kx,kxm->km", table.field_enu()[mirror], rot)
+    known = pattern.frequency_hz
+    at = np.stack([(field * pattern.table(f).vector(toward, own)).sum(axis=1) for f in known], axis=1)
+    rf_hz = site.radio.centre_frequency_hz + site.line_hz[table.tx]
+    out = np.repeat(table.a_theta[:, None], rf_hz.shape[1], axis=1)
+    weight = quadratic(rf_hz[mirror], known) if len(known) == 3 else np.ones((1, len(mirror), rf_hz.shape[1]))
+    out[mirror] = np.einsum("fkl,kf->kl", weight, at)
+    return out
+
+
 # -- lines ---------------------------------------------------------------------------------------------------
 
 
 def lines_of(site: Scenario, table: Table, amplitude: Complex) -> Complex:
-    """Return (receiver, transmitter, line) the sum over rays, each line at its own frequency; one at 60 m."""
+    """Return (receiver, transmitter, line) the sum over rays, each line at its own frequency; one at 60 m.
+
+    ``amplitude`` (ray,) is what the antenna makes of each, or (ray, line) where that depends on frequency.
+    """
     out = np.zeros((len(table.rx_names), *site.line_hz.shape), np.complex128)
-    scaled = amplitude * (4.0 * np.pi * REFERENCE_M * table.frequency_hz / SPEED_MPS)
+    scaled = amplitude.reshape(len(table.rx), -1) * (4.0 * np.pi * REFERENCE_M * table.frequency_hz / SPEED_MPS)
     rf_hz = site.radio.centre_frequency_hz + site.line_hz[table.tx]
     turns = rf_hz * (table.length_m / SPEED_MPS)[:, None]
-    np.add.at(out, (table.rx, table.tx), scaled[:, None] * np.exp(-2j * np.pi * turns))
+    np.add.at(out, (table.rx, table.tx), scaled * np.exp(-2j * np.pi * turns))
     return out
 
 
