@@ -46,7 +46,12 @@ class ReceivingAntenna(Protocol):
         """Whether what the mirror's own plate does is in it already."""
 
     def receive(
-        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+        self,
+        field_enu: ComplexArray,
+        towards_enu: FloatArray,
+        rot: FloatArray,
+        receiver: IntArray,
+        transmitter: IntArray,
     ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """Return voltages (ray,), their slopes by a turn of the mirror (ray, xyz) and their errors (ray,).
 
@@ -57,8 +62,8 @@ class ReceivingAntenna(Protocol):
             Unit vectors from the receiver to where the ray comes from.
         rot : (ray, 3, 3)
             Orientation of the mirror, to ENU from the mirror frame.
-        receiver : (ray,)
-            Of the mirror.
+        receiver, transmitter : (ray,)
+            Which of the mirror's receivers, and whose carrier.
         """
 
 
@@ -77,7 +82,12 @@ class VerticalAntenna:
         return False
 
     def receive(
-        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+        self,
+        field_enu: ComplexArray,
+        towards_enu: FloatArray,
+        rot: FloatArray,
+        receiver: IntArray,
+        transmitter: IntArray,
     ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """See `ReceivingAntenna`."""
         voltage = (field_enu * _theta_hat(towards_enu)).sum(axis=1)
@@ -86,31 +96,49 @@ class VerticalAntenna:
 
 @dataclass(frozen=True, slots=True)
 class PatternAntenna:
-    """Answers as a table says, fixed to the mirror."""
+    """Answers as a pattern says, fixed to the mirror.
+
+    Attributes
+    ----------
+    table
+        Of all receivers at the carrier of the first transmitter, then at that of the second, and so on.
+    n_receiver
+        Of a mirror.
+    strength, holds_own_plate
+        See `ReceivingAntenna`.
+    """
 
     table: PatternTable
+    n_receiver: int
     strength: float
     holds_own_plate: bool
 
     @classmethod
-    def of(cls, pattern: AntennaPattern, frequency_hz: float, *, holds_own_plate: bool) -> PatternAntenna:
-        """Return the antenna at one frequency."""
-        table = pattern.table(frequency_hz)
+    def of(cls, pattern: AntennaPattern, carrier_rf_hz: FloatArray, *, holds_own_plate: bool) -> PatternAntenna:
+        """Return the antenna at the transmitters' carriers: before a plate, half a per cent of frequency matters."""
+        tables = [pattern.table(f) for f in carrier_rf_hz.tolist()]
         n_polar = 19
         towards = grid_directions(n_polar, 36).reshape(-1, 3)
         weight = np.repeat(np.sin(np.linspace(0.0, np.pi, n_polar)), 36)
-        power = [
-            (np.abs(table.vector(towards, r)) ** 2).sum(axis=1) @ weight / weight.sum() for r in range(table.n_receiver)
-        ]
-        return cls(table, float(np.sqrt(0.5 * np.mean(power))), holds_own_plate)
+        first = tables[0]
+        power = [(np.abs(first.vector(towards, r)) ** 2).sum(axis=1) @ weight for r in range(first.n_receiver)]
+        table = PatternTable(
+            coefficient=np.concatenate([t.coefficient for t in tables]), sigma=np.concatenate([t.sigma for t in tables])
+        )
+        return cls(table, first.n_receiver, float(np.sqrt(0.5 * np.mean(power) / weight.sum())), holds_own_plate)
 
     def receive(
-        self, field_enu: ComplexArray, towards_enu: FloatArray, rot: FloatArray, receiver: IntArray
+        self,
+        field_enu: ComplexArray,
+        towards_enu: FloatArray,
+        rot: FloatArray,
+        receiver: IntArray,
+        transmitter: IntArray,
     ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
         """See `ReceivingAntenna`."""
         field = np.einsum("kba,kb->ka", rot, field_enu)
         towards = np.einsum("kba,kb->ka", rot, towards_enu)
-        vector, slope, sigma = self.table.vector_and_slope(towards, receiver)
+        vector, slope, sigma = self.table.vector_and_slope(towards, transmitter * self.n_receiver + receiver)
         out = np.empty((len(field), 3), np.complex128)
         for q, axis in enumerate(np.eye(3)):
             # the world turns the other way about the mirror: x in the mirror's frame changes by Rᵀ (x × axis)
@@ -132,7 +160,6 @@ def antenna_of(scenario: Scenario) -> ReceivingAntenna:
         The pattern's file is missing or damaged.
     """
     table = scenario.antenna
-    frequency_hz = float(scenario.carrier_rf_hz.mean())
     places = np.array(scenario.heliostat[0].receiver_mirror_m)
     if table.pattern is not None:
         pattern = read_pattern(table.pattern).pattern
@@ -142,10 +169,11 @@ def antenna_of(scenario: Scenario) -> ReceivingAntenna:
                 f"and those of scenario `{scenario.name}` are at {places.round(3).tolist()}; give the pattern of this "
                 "mirror"
             )
-        return PatternAntenna.of(pattern, frequency_hz, holds_own_plate=True)
+        return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
     if table.receiver == "dipole":
-        pattern = dipole_pattern(places, table.axis_mirror, frequency_hz)
-        return PatternAntenna.of(pattern, frequency_hz, holds_own_plate=False)
+        mean_hz = float(scenario.carrier_rf_hz.mean())
+        pattern = dipole_pattern(places, table.axis_mirror, mean_hz)
+        return PatternAntenna.of(pattern, np.full(len(scenario.transmitter), mean_hz), holds_own_plate=False)
     return VerticalAntenna()
 
 
@@ -191,12 +219,12 @@ class SiteField:
         )
         things = _with_soil(found.surroundings, soil_change, scenario)
         rays = self._rays(stand, things)
-        receiver = _receivers(rays, group.places_m.shape[1], len(scenario.transmitter))
-        mirror = _mirrors(rays, group.places_m.shape[1] * len(scenario.transmitter))
+        link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+        at_receiver, transmitter = np.divmod(link, len(scenario.transmitter))
+        mirror, receiver = np.divmod(at_receiver, group.places_m.shape[1])
         at = pivot[mirror] + np.einsum("kab,kb->ka", rot[mirror], rays.place_mirror_m)
         towards = geometry.unit(rays.source_enu_m - at) if rays.n_ray else rays.source_enu_m
-        voltage, slope, error = self._antenna.receive(rays.field_enu, towards, rot[mirror], receiver)
-        link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+        voltage, slope, error = self._antenna.receive(rays.field_enu, towards, rot[mirror], receiver, transmitter)
         vague = np.zeros(len(rays.first) - 1)
         np.add.at(vague, link, error**2)
         return Voltages(
@@ -240,14 +268,6 @@ def _with_soil(things: Surroundings, change: complex, scenario: Scenario) -> Sur
             normal_enu=soil.normal_enu,
         ),
     )
-
-
-def _mirrors(rays: Rays, n_link: int) -> IntArray:
-    return np.repeat(np.arange(len(rays.first) - 1) // n_link, np.diff(rays.first))
-
-
-def _receivers(rays: Rays, n_receiver: int, n_transmitter: int) -> IntArray:
-    return np.repeat(np.arange(len(rays.first) - 1) // n_transmitter % n_receiver, np.diff(rays.first))
 
 
 def _joined(parts: list[Voltages]) -> Voltages:
