@@ -1,6 +1,7 @@
 """Poses outdoors: carriers compared between a mirror's receivers, with the rays in the model that geometry foresees."""
 
 from rfpose.multilat.site.fit import (
+    Common,
     SiteKnowledge,
     SiteObservations,
     SitePoses,
@@ -11,6 +12,7 @@ from rfpose.multilat.site.fit import (
 )
 
 __all__ = [
+    "Common",
     "SiteKnowledge",
     "SiteObservations",
     "SitePoses",

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_rows
+from rfpose.jit import kernel, kernel_fast, kernel_rows
 
 _MAX_STEP_RAD = 0.05
 _SETTLED_SIGMAS = 2e-2
@@ -121,7 +121,7 @@ def turn_between(rot_to, rot_from, out):
         out *= np.arctan2(sine, cosine) / sine
 
 
-@kernel
+@kernel_fast
 def cholesky(a, n):
     """Replace the lower triangle of a by its Cholesky factor; false where it is not positive definite."""
     for j in range(n):
@@ -140,7 +140,7 @@ def cholesky(a, n):
     return True
 
 
-@kernel
+@kernel_fast
 def forward(lower, n, rhs, n_column):
     """Solve lower · x = rhs in place, column by column together."""
     for i in range(n):
@@ -233,7 +233,38 @@ def add_soil_errors(begin, end, heard, part, h, row_of, share, n, s):
     share[:n] = 0.0
 
 
-@kernel
+@kernel_fast
+def invert(lower, n, out):
+    """Invert a lower triangle; above its diagonal ``out`` keeps what it had."""
+    for i in range(n):
+        f = 1.0 / lower[i, i]
+        for c in range(i):
+            out[i, c] = 0.0
+        for k in range(i):
+            g = -f * lower[i, k]
+            for c in range(k + 1):
+                out[i, c] += g * out[k, c]
+        out[i, i] = f
+
+
+@kernel_fast
+def square(a, n, n_par, normal, gradient):
+    """Normal equations of whitened rows, the right-hand side in the last column."""
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    for i in range(n):
+        for p in range(n_par):
+            f = a[i, p]
+            if f != 0.0:
+                for q in range(p + 1):
+                    normal[p, q] += f * a[i, q]
+                gradient[p, 0] += f * a[i, n_par]
+    for p in range(n_par):
+        for q in range(p):
+            normal[q, p] = normal[p, q]
+
+
+@kernel_fast
 def tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen):
     """What measurements say of one standardised factor error: its estimate, and how much of it they tell (0 to 1)."""
     u = 0.0
@@ -424,17 +455,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                 failed = True
                 break
             forward(lower, n, a, n_par + 1)
-            for p in range(n_par):
-                for q in range(p + 1):
-                    t_sum = 0.0
-                    for i in range(n):
-                        t_sum += a[i, p] * a[i, q]
-                    normal[p, q] = t_sum
-                    normal[q, p] = t_sum
-                t_sum = 0.0
-                for i in range(n):
-                    t_sum += a[i, p] * a[i, n_par]
-                gradient[p, 0] = t_sum
+            square(a, n, n_par, normal, gradient)
             # priors: posture, mount, pivot, clocks
             turn_between(prior.commanded_rot[m], rot, off)
             for q in range(3):
@@ -489,10 +510,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                 residual[i] = e
                 total += weight[i] * e * e / variance[i]
             # degrees of freedom of what is left: trace of D (S⁻¹ − S⁻¹ A N⁻¹ Aᵀ S⁻¹)
-            inverse[:n, :n] = 0.0
-            for i in range(n):
-                inverse[i, i] = 1.0
-            forward(lower, n, inverse[:, :n], n)
+            invert(lower, n, inverse)
             dof = 0.0
             for i in range(n):
                 d = 0.0
@@ -500,11 +518,11 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                     d += inverse[k, i] ** 2
                 part_dof[i] = d * variance[i] / weight[i]
             for i in range(n):
-                for p in range(n_par):
-                    x = 0.0
-                    for k in range(i, n):
-                        x += inverse[k, i] * a[k, p]
-                    seen[p] = x
+                seen[:] = 0.0
+                for k in range(i, n):
+                    f = inverse[k, i]
+                    for p in range(n_par):
+                        seen[p] += f * a[k, p]
                 for p in range(n_par):
                     x = seen[p]
                     for q in range(p):

@@ -55,15 +55,18 @@ _FIRST_FLOOR = 0.05
 _TAILS = (3.0, 8.0, 30.0)
 _LEARN_ROUNDS = 15
 _LEARN_SETTLED = 0.03
-_LEARN_MIRRORS = 400
+_LAST_ROUNDS = 2
+"""How often rays are foreseen anew once that is learned."""
+_LEARN_MIRRORS = 200
 """Mirrors, spread over all, from which is found what all have in common."""
 _LEAST_FACTOR_SCALE = 0.01
 _FACTOR_PRIOR = 1.0
 """So many factors' worth count the stated sigmas against what residuals say of them."""
 _SOIL_STEP = 2.0
 """Standard deviations by which the permittivity is changed at once: rays are linear in it for so far."""
-_LEAST_SOIL_SIGMA = 0.01
-"""Relative; no ground is of one permittivity all over."""
+_LEAST_SOIL_SIGMA = 1e-3
+_MORE_ROUNDS = 5
+"""So many more, while the ground's constants still change by more than they are uncertain."""
 _AMBIGUOUS_COST = 9.0
 """Two poses apart whose costs (twice the log likelihood) differ by less may each be the true one."""
 _APART = 0.15
@@ -258,9 +261,9 @@ class SitePoses:
         return np.asarray(cross @ self.cov[:, 3:, 3:] @ cross.swapaxes(1, 2))
 
 
-FieldAt = Callable[[FloatArray, FloatArray, complex], Voltages]
-"""From pivots (mirror, xyz), orientations (mirror, 3, 3) and a relative change of the ground's complex permittivity to
-what the antennas would receive there."""
+FieldAt = Callable[[FloatArray, FloatArray, "Common"], Voltages]
+"""From pivots (mirror, xyz), orientations (mirror, 3, 3; NaN: of this mirror no rays are wanted) and what is known of
+the ground to what the antennas would receive there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -321,18 +324,32 @@ def fit_site(
     known = np.asarray(
         np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
     )
-    state = _State.begin(knowledge)
-    common = given
+    everyone = np.flatnonzero(known)
+    some = everyone[
+        np.unique(np.linspace(0, max(len(everyone) - 1, 0), _LEARN_MIRRORS).astype(np.int64))[: len(everyone)]
+    ]
+    common, state, before = given, _State.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
-    state = _of_all_starts(fit, field_at, state, known, common)
-    for _ in range(chosen.rounds):
-        voltages = field_at(state.pivot, state.rot, common.soil_change)
-        common = fit.learn(voltages, state, known, common)
-        if common.soil_change != 0j:
-            voltages = field_at(state.pivot, state.rot, common.soil_change)
-        state = fit.run(voltages, state, np.flatnonzero(known), common)
-    state = _of_all_starts(fit, field_at, state, known, common)
+    state = _of_all_starts(fit, field_at, state, some, common)
+    for k in range(chosen.rounds + _MORE_ROUNDS):
+        if k >= chosen.rounds and abs(common.soil_change - before) < max(common.soil_sigma):
+            break
+        before = common.soil_change
+        # each time about the constants found last, as uncertain as they were given: rays are not linear in them
+        common = replace(common, soil_sigma=chosen.soil_sigma)
+        common = fit.learn(_field_of(field_at, state, some, common), state, some, common)
+        state = fit.run(fit.prepare(_field_of(field_at, state, some, common)), state, some, common)
+    state = _of_all_starts(fit, field_at, state, everyone, common)
+    for _ in range(_LAST_ROUNDS):
+        state = fit.run(fit.prepare(_field_of(field_at, state, everyone, common)), state, everyone, common)
     return fit.outcome(state, known, common)
+
+
+def _field_of(field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> Voltages:
+    """Return what some mirrors would receive where they are found to be."""
+    rot = np.full(state.rot.shape, np.nan)
+    rot[rows] = state.rot[rows]
+    return field_at(state.pivot, rot, common)
 
 
 def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float) -> FloatArray:
@@ -454,7 +471,7 @@ class _Fit:
         )
 
     def run(
-        self, voltages: Voltages, state: _State, rows: IntArray, common: Common, told: _Told | None = None
+        self, prepared: _Prepared, state: _State, rows: IntArray, common: Common, told: _Told | None = None
     ) -> _State:
         """Fit some mirrors from where they stand; the others stay."""
         out = state.copy()
@@ -466,7 +483,7 @@ class _Fit:
             len(rows),
             rows,
             self._links,
-            self._heard(voltages, common),
+            prepared.heard(self.settings, common),
             self._prior,
             _kernels.Law(common.floor, common.tail, self._own_scale, _MAX_STEPS),
             _kernels.Ended(
@@ -477,36 +494,27 @@ class _Fit:
         )  # fmt: skip
         return out
 
-    def _heard(self, voltages: Voltages, common: Common) -> _kernels.Heard:
-        rays = voltages.rays
-        order, group, amplitude, phase, link_of = _grouped(
-            rays, self.seen.carrier.shape, self.settings.factor_sigma, common.factor_scale
-        )
-        return _kernels.Heard(
-            first=rays.first, link_of=link_of, source=rays.source_enu_m, place=rays.place_mirror_m, extra=rays.extra_m,
-            voltage=voltages.voltage, slope=voltages.slope, soil_slope=voltages.soil_slope, vague=voltages.vague,
-            kind=rays.kind, order=order, group=group, amplitude_error=amplitude, phase_error=phase,
-            soil_error=np.array(common.soil_sigma), reference_rot=voltages.reference_rot,
-        )  # fmt: skip
+    def prepare(self, voltages: Voltages) -> _Prepared:
+        """Sort rays as the kernel wants them."""
+        return _Prepared.of(voltages, self.seen.carrier.shape)
 
-    def learn(self, voltages: Voltages, state: _State, known: BoolArray, common: Common) -> Common:
-        """Return what all mirrors' residuals say of what they have in common (restricted maximum likelihood)."""
-        rows = np.flatnonzero(known)
-        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _LEARN_MIRRORS).astype(np.int64))] if len(rows) else rows
+    def learn(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> Common:
+        """Return what mirrors' residuals say of what all have in common (restricted maximum likelihood)."""
+        prepared = self.prepare(voltages)
         tails = _TAILS if self.settings.tail is None else (self.settings.tail,)
         best = np.inf
         for tail in tails:
-            cost, found = self._learn_with(voltages, state, rows, replace(common, tail=tail))
+            cost, found = self._learn_with(prepared, state, rows, replace(common, tail=tail))
             if not cost < best:
                 break
             best, chosen = cost, found
         return common if np.isinf(best) else chosen
 
-    def _learn_with(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
+    def _learn_with(self, prepared: _Prepared, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
         given = common
         told = _Told.of(len(state.cost))
         for _ in range(_LEARN_ROUNDS):
-            state = self.run(voltages, state, rows, common, told)
+            state = self.run(prepared, state, rows, common, told)
             last, common = common, self._learned(state, told, rows, common)
             if _alike(last, common):
                 break
@@ -578,64 +586,82 @@ def _redundancy(weight: FloatArray) -> IntArray:
     return np.asarray(used.sum(axis=(1, 2)) - used.any(axis=1).sum(axis=1) - 6)
 
 
-def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, known: BoolArray, common: Common) -> _State:
+def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> _State:
     """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
     knowledge = fit.known
     lever = float(np.nanmax(np.linalg.norm(knowledge.receiver_mirror_m, axis=-1), initial=0.0))
     wavelength = 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
     finite = knowledge.posture_sigma_rad[np.isfinite(knowledge.posture_sigma_rad)]
     turns = spread_starts(float(finite.max(initial=0.0)), max(lever, 1e-9), wavelength)[1:]
-    rows = np.flatnonzero(known)
     if not len(turns) or not len(rows):
         return state
-    near = field_at(knowledge.pivot_enu_m, knowledge.commanded_rot, common.soil_change)
+    commanded = replace(state, pivot=knowledge.pivot_enu_m, rot=knowledge.commanded_rot)
+    near = fit.prepare(_field_of(field_at, commanded, rows, common))
+    state = fit.run(near, state, rows[state.steps[rows] < 0], common)
     turned = np.empty((3, 3))
     for w in turns:
         _kernels.turn(w, turned)
-        start = replace(state, pivot=knowledge.pivot_enu_m, rot=turned @ knowledge.commanded_rot)
-        found = fit.run(near, start, rows, common)
+        found = fit.run(near, replace(commanded, rot=turned @ knowledge.commanded_rot), rows, common)
         off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
         ended = (found.steps > 0) & (found.steps < _MAX_STEPS)
         other = ended & (off > _APART * wavelength / lever)
         better = (ended & ~(state.steps > 0)) | (other & (found.cost < state.cost))
         alike = np.abs(found.cost - state.cost) < _AMBIGUOUS_COST
-        ambiguous = np.where(better, alike, state.ambiguous) | (other & alike)
-        if better.any():
-            moved = state.with_poses_of(found, better)
-            state = fit.run(field_at(moved.pivot, moved.rot, common.soil_change), moved, np.flatnonzero(better), common)
+        ambiguous = np.where(better, alike & other, state.ambiguous | (other & alike))
+        mine = rows[better[rows]]
+        if len(mine):
+            moved = state.with_poses_of(found, mine)
+            state = fit.run(fit.prepare(_field_of(field_at, moved, mine, common)), moved, mine, common)
         state = replace(state, ambiguous=ambiguous)
     return state
 
 
-def _grouped(
-    rays: Rays, shape: tuple[int, ...], factor_sigma: dict[RayKind, tuple[float, float]], scale: FloatArray
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]:
-    """Put rays that share their factor's error beside each other, mirror by mirror.
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """Rays in the order that the kernel wants them: those that share their factor's error beside each other.
 
-    Returns
-    -------
+    Attributes
+    ----------
+    voltages
     order : (ray,)
         Rays by mirror and group.
     group : (ray,)
-        −1: no error; else equal for rays of one mirror that share it.
-    amplitude, phase : (ray,)
-        Of the factor.
+        Equal for rays of one mirror that share their factor's error.
     link_of : (ray,)
         Within the mirror.
     """
-    n_link = shape[1] * shape[2]
-    link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
-    mirror, link_of = np.divmod(link, n_link)
-    transmitter = link_of % shape[2]
-    sigma = np.array([factor_sigma.get(kind, (0.0, 0.0)) for kind in RayKind])
-    amplitude, phase = (sigma * scale[:, None])[rays.kind].T
-    shared = np.where(rays.kind == RayKind.GROUND, 0, transmitter)
-    thing = np.where(rays.kind == RayKind.GROUND, -1, rays.thing)
-    key = np.stack([rays.kind, thing, shared], axis=1)
-    group = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1) if len(key) else np.zeros(0, np.int64)
-    group = np.where((amplitude > 0.0) | (phase > 0.0), group, -1)
-    order = np.lexsort((group, mirror))
-    return order, group, np.ascontiguousarray(amplitude), np.ascontiguousarray(phase), link_of
+
+    voltages: Voltages
+    order: IntArray
+    group: IntArray
+    link_of: IntArray
+
+    @classmethod
+    def of(cls, voltages: Voltages, shape: tuple[int, ...]) -> _Prepared:
+        """Sort the rays of mirrors with so many receivers and transmitters."""
+        rays = voltages.rays
+        link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+        mirror, link_of = np.divmod(link, shape[1] * shape[2])
+        ground = rays.kind == RayKind.GROUND
+        shared = np.where(ground, 0, link_of % shape[2])
+        thing = np.where(ground, 0, rays.thing.astype(np.int64) + 1)
+        group = (thing * shape[2] + shared) * len(RayKind) + rays.kind
+        order = np.lexsort((group, mirror))
+        return cls(voltages, np.asarray(order, np.int64), np.asarray(group, np.int64), link_of)
+
+    def heard(self, settings: SiteSettings, common: Common) -> _kernels.Heard:
+        """Return what the kernel takes."""
+        voltages, rays = self.voltages, self.voltages.rays
+        sigma = np.array([settings.factor_sigma.get(kind, (0.0, 0.0)) for kind in RayKind])
+        amplitude, phase = (sigma * common.factor_scale[:, None])[rays.kind].T
+        exact = (amplitude == 0.0) & (phase == 0.0)
+        return _kernels.Heard(
+            first=rays.first, link_of=self.link_of, source=rays.source_enu_m, place=rays.place_mirror_m,
+            extra=rays.extra_m, voltage=voltages.voltage, slope=voltages.slope, soil_slope=voltages.soil_slope,
+            vague=voltages.vague, kind=rays.kind, order=self.order, group=np.where(exact, -1, self.group),
+            amplitude_error=np.ascontiguousarray(amplitude), phase_error=np.ascontiguousarray(phase),
+            soil_error=np.array(common.soil_sigma), reference_rot=voltages.reference_rot,
+        )  # fmt: skip
 
 
 def _cross(v: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from rfpose import geometry
 from rfpose.antenna import AntennaPattern, PatternTable, dipole_pattern, grid_directions
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.multilat.site import Voltages
+from rfpose.multilat.site import Common, Voltages
 from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.mirrors import MirrorGroup
 from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, foresee
@@ -30,6 +30,8 @@ _log = logging.getLogger(__name__)
 _VACUUM_PERMITTIVITY = 8.8541878128e-12
 _SOIL_STEP = 1e-3
 """Relative change of the permittivity by which rays' slope with it is found."""
+_CERTAIN = 0.01
+"""Relative uncertainty of the permittivity below which that matters no more."""
 _SAME_PLACE_M = 0.05
 """A pattern's receivers may be this far from the scenario's."""
 
@@ -197,15 +199,15 @@ class SiteField:
             propagation_speed_mps=scenario.radio.propagation_speed_mps,
         )
 
-    def __call__(self, pivot_enu_m: FloatArray, rot: FloatArray, soil_change: complex) -> Voltages:
+    def __call__(self, pivot_enu_m: FloatArray, rot: FloatArray, common: Common) -> Voltages:
         """Return what the mirrors would receive; the first axis is frame × heliostat of the group."""
         n_frame, n_helio = len(self._commanded), len(self._group.column)
         pivot = pivot_enu_m.reshape(n_frame, n_helio, 3)
         turned = rot.reshape(n_frame, n_helio, 3, 3)
-        parts = [self._frame(pivot[f], turned[f], self._commanded[f], soil_change) for f in range(n_frame)]
+        parts = [self._frame(pivot[f], turned[f], self._commanded[f], common) for f in range(n_frame)]
         return _joined(parts)
 
-    def _frame(self, pivot: FloatArray, rot: FloatArray, commanded: FloatArray, soil_change: complex) -> Voltages:
+    def _frame(self, pivot: FloatArray, rot: FloatArray, commanded: FloatArray, common: Common) -> Voltages:
         scenario, group = self._scenario, self._group
         standing = commanded.copy()
         known = np.isfinite(rot).all(axis=(1, 2))
@@ -217,7 +219,7 @@ class SiteField:
             receiver_mirror_m=group.places_m,
             own_plate=found.own_plate[group.column],
         )
-        things = _with_soil(found.surroundings, soil_change, scenario)
+        things = _with_soil(found.surroundings, common.soil_change, scenario)
         rays = self._rays(stand, things)
         link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
         at_receiver, transmitter = np.divmod(link, len(scenario.transmitter))
@@ -227,10 +229,9 @@ class SiteField:
         voltage, slope, error = self._antenna.receive(rays.field_enu, towards, rot[mirror], receiver, transmitter)
         vague = np.zeros(len(rays.first) - 1)
         np.add.at(vague, link, error**2)
-        return Voltages(
-            rays=rays, voltage=voltage, slope=slope, soil_slope=self._soil_slope(stand, things, rays), vague=vague,
-            reference_rot=rot,
-        )  # fmt: skip
+        certain = max(common.soil_sigma) <= _CERTAIN
+        soil_slope = np.zeros(rays.n_ray, np.complex128) if certain else self._soil_slope(stand, things, rays)
+        return Voltages(rays=rays, voltage=voltage, slope=slope, soil_slope=soil_slope, vague=vague, reference_rot=rot)
 
     def _rays(self, stand: Stand, things: Surroundings) -> Rays:
         scenario = self._scenario
