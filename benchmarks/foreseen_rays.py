@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import re
 import runpy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -180,12 +180,16 @@ def summed(link: np.ndarray, field: np.ndarray, way_m: np.ndarray, carrier_hz: f
     return out
 
 
-def phases_apart(traced: Traced, rays: Rays) -> tuple[float, float]:
-    """Return rms and median phase [rad] between summed upward fields, over links whose direct ray the table has."""
+def phases_apart(traced: Traced, rays: Rays, only: np.ndarray | None = None) -> tuple[float, float]:
+    """Return rms and median phase [rad] between summed upward fields, over links whose direct ray the table has.
+
+    ``only`` are the foreseen rays that count.
+    """
     n_link = len(rays.first) - 1
     link, way = lengths_m(rays, traced.mirrors, len(traced.transmitter_enu_m))
     theirs = summed(traced.link, traced.field_enu, traced.length_m, traced.carrier_hz, n_link)[:, 2]
-    ours = summed(link, rays.field_enu, way, traced.carrier_hz, n_link)[:, 2]
+    use = np.arange(rays.n_ray) if only is None else only
+    ours = summed(link[use], rays.field_enu[use], way[use], traced.carrier_hz, n_link)[:, 2]
     seen = np.zeros(n_link, bool)
     seen[traced.link[traced.kind == RayKind.DIRECT]] = True
     apart = np.abs(np.angle(ours * theirs.conj()))[seen & (np.abs(ours) > 0)]
@@ -193,11 +197,15 @@ def phases_apart(traced: Traced, rays: Rays) -> tuple[float, float]:
 
 
 STEPS = {
-    "direct, no obstacles": Foresight(visibility=False, ground=False, specular=False, own_plate=False),
-    "and visibility": Foresight(ground=False, specular=False, own_plate=False),
-    "and ground": Foresight(specular=False, own_plate=False),
-    "and specular": Foresight(own_plate=False),
-    "and own plate": Foresight(),
+    "direct, no obstacles": Foresight(
+        visibility=False, ground=False, specular=False, diffracted=False, own_plate=False
+    ),
+    "and visibility": Foresight(ground=False, specular=False, diffracted=False, own_plate=False),
+    "and ground": Foresight(specular=False, diffracted=False, own_plate=False),
+    "and specular": Foresight(diffracted=False, own_plate=False),
+    "and own plate": Foresight(diffracted=False),
+    "and diffracted": Foresight(),
+    "or as the tracer has it": Foresight(wedge="sionna"),
 }
 
 
@@ -208,7 +216,7 @@ def generic(code: str) -> str:
 
 def report(traced: Traced) -> None:
     """Print a table's comparison."""
-    options = replace(Foresight(), reach_m=1e3, faint=0.0)
+    options = Foresight(reach_m=1e3, faint=0.0, wedge="sionna")
     rays = foresee(
         traced.transmitter_enu_m, np.full(10, traced.carrier_hz), traced.mirrors, traced.surroundings, options
     )
@@ -230,12 +238,16 @@ def report(traced: Traced) -> None:
         print(
             f"  missed {code}: {len(some)}, strongest {20 * np.log10(level.max()):.1f} dB of a free ray of its length"
         )
+    rms, median = phases_apart(traced, rays, partner[partner >= 0])
+    print(
+        f"  those of the table      {np.sum(partner >= 0):6d} rays, phase of the sum off by rms {rms:.3f}, median {median:.4f} rad"
+    )
     for name, step in STEPS.items():
         some = foresee(
             traced.transmitter_enu_m, np.full(10, traced.carrier_hz), traced.mirrors, traced.surroundings, step
         )
         rms, median = phases_apart(traced, some)
-        print(f"  {name:22} {some.n_ray:6d} rays, phase of the sum off by rms {rms:.3f}, median {median:.4f} rad")
+        print(f"  {name:23} {some.n_ray:6d} rays, phase of the sum off by rms {rms:.3f}, median {median:.4f} rad")
 
 
 def main() -> None:

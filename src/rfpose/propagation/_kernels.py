@@ -8,6 +8,23 @@ Reflection at a plane of normal n and relative permittivity ε, s = sine of the 
     across the plane of incidence  (s − q) / (s + q),      in it  (ε s − q) / (ε s + q),
 
 the latter's sign kept by the component along n. Metal (ε given as zero): −1 and +1.
+
+Diffraction at the edge of a wedge whose faces stand at the angles 0 and nπ, from φ' and s' to φ and s, β the angle with
+the edge, by the uniform theory [1]_, L = s s' sin²β / (s + s'), F its transition function:
+
+    D = −e^{−jπ/4} / (2n √(2πk) sin β) · [T₊(φ−φ') + T₋(φ−φ') + R₀ T₋(φ+φ') + Rₙ T₊(φ+φ')],
+    T±(b) = cot((π ± b) / 2n) F(kL a±(b)),      a±(b) = 2 cos²(πnN± − b/2),      N± the integer nearest (b ± π) / 2πn,
+
+R₀, Rₙ the faces' coefficients, for what is not metal by Luebbers' heuristic [2]_; across: the field along the edge.
+Sionna RT 2.2 has instead T₊(φ−φ') − T₋(φ+φ') of what the first face reflects and T₋(φ−φ') − T₊(φ+φ') of what goes
+through, or of what the second face reflects where it is lit.
+
+References
+----------
+.. [1] R. G. Kouyoumjian, P. H. Pathak, A uniform geometrical theory of diffraction for an edge in a perfectly
+   conducting surface, Proc. IEEE 62 (1974) 1448-1461.
+.. [2] R. J. Luebbers, Finite conductivity uniform GTD versus knife edge diffraction, IEEE Trans. AP 32 (1984) 70-76.
+.. [3] J. A. C. Weideman, Computation of the complex error function, SIAM J. Numer. Anal. 31 (1994) 1497-1518.
 """
 
 from __future__ import annotations
@@ -30,11 +47,24 @@ NO_FACE = -1
 THE_GROUND = 0  # its number among the faces
 
 
+def _weideman(n: int) -> tuple[float, Float64]:
+    """Scale and coefficients, highest first, of the Faddeeva function's rational approximation [3]_."""
+    scale = float(np.sqrt(n / np.sqrt(2.0)))
+    t = scale * np.tan(np.arange(1 - 2 * n, 2 * n) * np.pi / (4 * n))
+    f = np.concatenate([[0.0], np.exp(-t * t) * (scale * scale + t * t)])
+    return scale, np.ascontiguousarray((np.fft.fft(np.fft.fftshift(f)).real / (4 * n))[n:0:-1])
+
+
+_SCALE, _COEFFICIENT = _weideman(20)
+_HALF_TURN = complex(math.sqrt(0.5), math.sqrt(0.5))  # e^{jπ/4}
+
+
 class Scene(NamedTuple):
     """What stands on the site.
 
     Plates come first among the things, then boxes, then the ground; among the faces the ground is first, then one for
-    each plate, then six for each box. ``permittivity`` (thing, transmitter) is zero for metal.
+    each plate, then six for each box; edges are four for each plate, then twelve for each box. ``permittivity`` (thing,
+    transmitter) is zero for metal.
     """
 
     transmitter: Float64
@@ -61,6 +91,14 @@ class Scene(NamedTuple):
     face_half: Float64
     face_thing: Int64
     two_sided: Int64
+    # edges: the point where each begins, its direction, in its first face away from it, out of that face, n, ...
+    edge_from: Float64
+    edge_along: Float64
+    edge_in: Float64
+    edge_out: Float64
+    edge_length: Float64
+    edge_wedge: Float64
+    edge_thing: Int64
     permittivity: Complex128
 
 
@@ -70,7 +108,9 @@ class Wanted(NamedTuple):
     hide: bool
     ground: bool
     specular: bool
+    diffracted: bool
     own_plate: bool
+    by_faces: bool
     faint: float
 
 
@@ -300,17 +340,27 @@ def fresnel(permittivity, s):
 
 
 @kernel
+def mirrored_way(direction, normal):
+    """Direction after reflection."""
+    return along(direction, -2.0 * dot(direction, normal), normal)
+
+
+@kernel
 def bounced(scene, t, f, direction, field):
     """Field after reflection at a face of a wave that travels along a direction."""
-    normal = axis(scene.face_rot, f, 2)
-    c = dot(direction, normal)
-    across, within = fresnel(scene.permittivity[scene.face_thing[f], t], abs(c))
+    return bounced_at(axis(scene.face_rot, f, 2), scene.permittivity[scene.face_thing[f], t], direction, field)
+
+
+@kernel
+def bounced_at(normal, permittivity, direction, field):
+    """Field after reflection at a plane."""
+    across, within = fresnel(permittivity, abs(dot(direction, normal)))
     side = cross(direction, normal)
     flat = length(side)
     if flat < 1e-9:
         return times(across, field)
     side = times(1.0 / flat, side)
-    before, after = cross(side, direction), cross(side, along(direction, -2.0 * c, normal))
+    before, after = cross(side, direction), cross(side, mirrored_way(direction, normal))
     s, p = across * dot(field, side), within * dot(field, before)
     return s * side[0] + p * after[0], s * side[1] + p * after[1], s * side[2] + p * after[2]
 
@@ -357,6 +407,147 @@ def in_beam(scene, f, image, a, spread):
     g = along(c, -dot(c, d) / dot(d, d), d)
     reach = math.sqrt(scene.face_half[f, 0] ** 2 + scene.face_half[f, 1] ** 2) + spread
     return dot(g, g) <= reach * reach
+
+
+# -- edges -------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def transition(x):
+    """Transition function of the uniform theory, ``2j √x e^{jx} ∫_√x^∞ e^{−jτ²} dτ``, for x ≥ 0."""
+    root = math.sqrt(x)
+    iz = -_HALF_TURN * root
+    below = 1.0 / (_SCALE - iz)
+    ratio = (_SCALE + iz) * below
+    p = 0j
+    for c in _COEFFICIENT:
+        p = p * ratio + c
+    return math.sqrt(math.pi) * root * _HALF_TURN * (2.0 * p * below * below + below / math.sqrt(math.pi))
+
+
+@kernel
+def wedge_term(n, b, sign, kl):
+    """``T±(b)``, sign being that of the index."""
+    turns = np.rint((b + sign * math.pi) / (2.0 * math.pi * n))
+    cosine = math.cos(math.pi * n * turns - 0.5 * b)
+    x = (math.pi + sign * b) / (2.0 * n)
+    sine = math.sin(x)
+    if abs(sine) < 1e-9:  # on the boundary itself both sides' mean
+        return 0j
+    return math.cos(x) / sine * transition(2.0 * kl * cosine * cosine)
+
+
+@kernel
+def about_edge(edge, direction):
+    """Unit vectors across a direction: the one around the edge, and the one beside it."""
+    around = cross(edge, direction)
+    around = times(1.0 / length(around), around)
+    return around, cross(direction, around)
+
+
+@kernel
+def carried(field, edge, direction, to_end):
+    """Field of a wave along a direction, given to one along another with its components about the edge."""
+    around, beside = about_edge(edge, direction)
+    around_too, beside_too = about_edge(edge, to_end)
+    a, b = dot(field, around), dot(field, beside)
+    return along(times(a, around_too), b, beside_too)
+
+
+@kernel
+def bent(scene, wanted, t, e, to_source, to_end, near, far, field):
+    """Field after diffraction at edge e of a wave that came ``near`` and goes ``far``, at its end; none within a wedge.
+
+    ``to_source`` and ``to_end`` are unit vectors from the edge; ``field`` is that on the edge.
+    """
+    n = scene.edge_wedge[e]
+    edge, inward, outward = at(scene.edge_along, e), at(scene.edge_in, e), at(scene.edge_out, e)
+    before = math.atan2(dot(to_source, outward), dot(to_source, inward)) % (2.0 * math.pi)
+    after = math.atan2(dot(to_end, outward), dot(to_end, inward)) % (2.0 * math.pi)
+    sine = math.sqrt(max(0.0, 1.0 - dot(to_source, edge) ** 2))
+    if before > n * math.pi or after > n * math.pi or sine < 1e-6:
+        return 0j, 0j, 0j
+    other = times(-1.0, inward)  # out of the second face
+    if dot(to_source, outward) < 0.0:  # the first face is the one that the source sees
+        outward, other = other, outward
+        before, after = n * math.pi - before, n * math.pi - after
+    k = scene.wavenumber[t]
+    kl = k * near * far / (near + far) * sine * sine
+    factor = -_HALF_TURN.conjugate() / (2.0 * n * math.sqrt(2.0 * math.pi * k) * sine)
+    factor *= math.sqrt(near / (far * (near + far)))
+    on, on_too = wedge_term(n, after - before, 1.0, kl), wedge_term(n, after - before, -1.0, kl)
+    off_0, off_n = wedge_term(n, after + before, -1.0, kl), wedge_term(n, after + before, 1.0, kl)
+    permittivity, direction = scene.permittivity[scene.edge_thing[e], t], times(-1.0, to_source)
+    through = carried(field, edge, direction, to_end)
+    if wanted.by_faces:
+        first = carried(
+            bounced_at(outward, permittivity, direction, field), edge, mirrored_way(direction, outward), to_end
+        )
+        if n * math.pi > math.pi + before:
+            second = through
+        else:
+            second = carried(
+                bounced_at(other, permittivity, direction, field), edge, mirrored_way(direction, other), to_end
+            )
+        return along(times(factor * (on - off_0), first), factor * (on_too - off_n), second)
+    across_0, within_0 = fresnel(permittivity, abs(dot(to_source, outward)))
+    across_n, within_n = fresnel(permittivity, abs(dot(to_end, other)))
+    around, beside = about_edge(edge, to_end)
+    soft = on + on_too + across_0 * off_0 + across_n * off_n
+    hard = on + on_too + within_0 * off_0 + within_n * off_n
+    a, b = factor * hard * dot(through, around), factor * soft * dot(through, beside)
+    return along(times(a, around), b, beside)
+
+
+@kernel
+def edge_point(scene, e, source, end):
+    """Whether an edge turns a ray from a source to an end, and where: the same angle to the edge on both sides."""
+    along_edge = at(scene.edge_along, e)
+    a, b = minus(source, at(scene.edge_from, e)), minus(end, at(scene.edge_from, e))
+    za, zb = dot(a, along_edge), dot(b, along_edge)
+    ra, rb = length(along(a, -za, along_edge)), length(along(b, -zb, along_edge))
+    z = (za * rb + zb * ra) / (ra + rb)
+    return ra > 1e-6 and rb > 1e-6 and 0.0 < z < scene.edge_length[e], along(at(scene.edge_from, e), z, along_edge)
+
+
+@kernel
+def diffracted(scene, wanted, t, e, before, after, a, weak):
+    """Whether transmitter t's ray bent by edge e reaches a, its field, the edge's point, the ways to that and from it.
+
+    The ground may turn the ray ``before`` or ``after``.
+    """
+    nothing = (0j, 0j, 0j)
+    origin = at(scene.transmitter, t)
+    source = mirrored(scene, THE_GROUND, origin) if before else origin
+    end = mirrored(scene, THE_GROUND, a) if after else a
+    ok, q = edge_point(scene, e, source, end)
+    if not ok:
+        return False, nothing, q, 0.0, 0.0
+    near, far = length(minus(q, source)), length(minus(end, q))
+    g = origin
+    if before:
+        ok, g = meets(scene, THE_GROUND, source, q)
+    h = a
+    if ok and after:
+        ok, h = meets(scene, THE_GROUND, end, q)
+    if not ok:
+        return False, nothing, q, near, far
+    field = launched(scene, towards(origin, g if before else q))
+    if before:
+        field = bounced(scene, t, THE_GROUND, towards(origin, g), field)
+    field = times(1.0 / near, field)
+    field = bent(scene, wanted, t, e, towards(q, g), towards(q, h), near, far, field)
+    if after:
+        field = bounced(scene, t, THE_GROUND, towards(q, h), field)
+    if size(field) < weak:
+        return False, nothing, q, near, far
+    thing = scene.edge_thing[e]
+    ok = free(scene, wanted, g, q, thing, NOTHING) and free(scene, wanted, q, h, thing, NOTHING)
+    if ok and before:
+        ok = free(scene, wanted, origin, g, NOTHING, NOTHING)
+    if ok and after:
+        ok = free(scene, wanted, h, a, NOTHING, NOTHING)
+    return ok, field, q, near, far
 
 
 # -- links -------------------------------------------------------------------------------------------------------------
@@ -450,6 +641,31 @@ def off_own_plate(scene, wanted, receivers, found, m, t, first, middle, spread):
 
 
 @kernel
+def round_edges(scene, wanted, receivers, found, m, t, first, behind):
+    """Add the rays that edges ``first`` to ``behind`` bend, alone, and with the ground before or after."""
+    origin = at(scene.transmitter, t)
+    for r in range(receivers.place.shape[1]):
+        a, place = receiver_at(receivers, m, r), at(receivers.place[m], r)
+        if math.isnan(a[0]):
+            continue
+        weak = wanted.faint / length(minus(a, origin))
+        for e in range(first, behind):
+            thing = scene.edge_thing[e]
+            for before, after in ((False, False), (True, False), (False, True)):
+                if (before or after) and not wanted.ground:
+                    continue
+                ok, field, q, near, far = diffracted(scene, wanted, t, e, before, after, a, weak)
+                if not ok:
+                    continue
+                if thing == receivers.own[m]:  # its edges turn with the mirror
+                    source = mirrored(scene, THE_GROUND, origin) if before else origin
+                    put(found, m, r, t, source, in_mirror(receivers, m, q), far, field, OWN_PLATE, thing)
+                else:
+                    source = mirrored(scene, THE_GROUND, q) if after else q
+                    put(found, m, r, t, source, place, near, field, DIFFRACTED, thing)
+
+
+@kernel
 def unturned(scene, wanted, receivers, found, m, t):
     """Add direct rays and those off the ground."""
     origin = at(scene.transmitter, t)
@@ -487,6 +703,13 @@ def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found)
                         off_face(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
                 for f in range(first_of_boxes, behind):
                     off_face(scene, wanted, receivers, found, m, t, f, here, spread[m])
+            if wanted.diffracted:
+                for p in near:
+                    if p != own:
+                        round_edges(scene, wanted, receivers, found, m, t, 4 * p, 4 * p + 4)
+                round_edges(scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0])
+                if wanted.own_plate and own >= 0:
+                    round_edges(scene, wanted, receivers, found, m, t, 4 * own, 4 * own + 4)
             if wanted.own_plate and own >= 0:
                 off_own_plate(scene, wanted, receivers, found, m, t, NO_FACE, here, spread[m])
                 if wanted.ground:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.propagation import _kernels
 from rfpose.propagation.rays import Rays
-from rfpose.propagation.surroundings import Stand, Surroundings
+from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, Soil, Stand, Surroundings
 
 __all__ = ["Foresight", "foresee"]
 
@@ -24,6 +24,8 @@ SPEED_OF_LIGHT_MPS = 299_792_458.0
 _VACUUM_PERMITTIVITY = 8.8541878128e-12
 _HAIR = 1e-6
 """Share of a plate's diagonal by which a receiver that lies in its plate stands out of it, to the front."""
+_FOOT_M = 0.05
+"""Edges lower than this over the ground are a box's foot."""
 _BLOCK_LINKS = 30_000
 """Links whose rays are found at once, into room that is used again: tens of megabytes."""
 
@@ -40,12 +42,17 @@ class Foresight:
         Rays off the ground, alone and together with the others.
     specular
         Rays off boxes and off plates within ``reach_m``, besides the mirror's own.
+    diffracted
+        Rays bent by the edges of boxes and of plates within ``reach_m``, once.
     own_plate
-        Rays off the mirror's own plate.
+        Rays off the mirror's own plate, and with ``diffracted`` round its edges.
     reach_m
         Plates farther from a mirror's receivers than this hide, but turn nothing to it [m].
     faint
         A ray weaker than this, against the direct one that nothing hinders, is left out; ground rays are not.
+    wedge
+        Coefficients of diffraction: ``uniform``, exact for metal half-planes; or those of Sionna RT (``sionna``), to
+        compare with its tables.
     antenna
         Of the transmitters, upright: ``isotropic``, of gain one, or the pattern of a ``half_wave`` dipole.
     propagation_speed_mps
@@ -55,9 +62,11 @@ class Foresight:
     visibility: bool = True
     ground: bool = True
     specular: bool = True
+    diffracted: bool = True
     own_plate: bool = True
     reach_m: float = 30.0
     faint: float = 1e-3
+    wedge: Literal["uniform", "sionna"] = "uniform"
     antenna: Literal["isotropic", "half_wave"] = "isotropic"
     propagation_speed_mps: float = SPEED_OF_LIGHT_MPS
 
@@ -67,6 +76,8 @@ class Foresight:
             raise InvalidInputError(f"`reach_m` must not be negative, got {self.reach_m}")
         if not 0.0 <= self.faint < 1.0:
             raise InvalidInputError(f"`faint` must be from zero to below one, got {self.faint}")
+        if self.wedge not in ("uniform", "sionna"):
+            raise InvalidInputError(f"`wedge` must be 'uniform' or 'sionna', got {self.wedge!r}")
         if self.antenna not in ("isotropic", "half_wave"):
             raise InvalidInputError(f"`antenna` must be 'isotropic' or 'half_wave', got {self.antenna!r}")
 
@@ -81,8 +92,9 @@ def foresee(
     """Return the rays that geometry lets one expect, for mirrors in the poses of one frame.
 
     Direct rays; rays off the ground, off plates and boxes, and off one of these and the ground, in either order; rays
-    off the mirror's own plate, also of what the ground or another thing turned before. Geometrical optics: a
-    reflection point must lie on the thing, every leg must be free.
+    off the mirror's own plate, also of what the ground or another thing turned before; rays that one edge bends, alone
+    or with the ground before or after. Geometrical optics with the uniform theory of diffraction: a point must lie on
+    the thing that turns the ray, every leg must be free.
 
     Parameters
     ----------
@@ -127,7 +139,9 @@ def foresee(
         hide=wanted.visibility,
         ground=wanted.ground and surroundings.soil is not None,
         specular=wanted.specular,
+        diffracted=wanted.diffracted,
         own_plate=wanted.own_plate,
+        by_faces=wanted.wedge == "sionna",
         faint=wanted.faint,
     )
     room, count, parts = 8, np.zeros((n_mirror, n_receiver, n_transmitter), np.int64), []
@@ -181,6 +195,7 @@ def _scene(transmitter: FloatArray, carrier_hz: FloatArray, things: Surroundings
     permittivity[n_plate:-1] = _complex(boxes.permittivity[:, None], boxes.conductivity_s_per_m[:, None], carrier_hz)
     if soil is not None:
         permittivity[-1] = _complex(soil.permittivity, soil.conductivity_s_per_m, carrier_hz)
+    edges = _edges(plates, half, boxes, box_centre, soil)
     return _kernels.Scene(
         transmitter=transmitter,
         wavenumber=2.0 * np.pi * carrier_hz / wanted.propagation_speed_mps,
@@ -204,7 +219,46 @@ def _scene(transmitter: FloatArray, carrier_hz: FloatArray, things: Surroundings
         face_thing=np.array(thing, np.int64),
         two_sided=(np.arange(len(thing)) - 1 < n_plate).astype(np.int64) * (np.arange(len(thing)) > 0),
         permittivity=permittivity,
+        **edges,
     )
+
+
+def _edges(
+    plates: PlatesStanding, half: FloatArray, boxes: BoxesStanding, box_centre: FloatArray, soil: Soil | None
+) -> dict[str, Any]:
+    """Return the edges' columns of the scene; edges at the foot of a box, on the ground, have no length."""
+    n_plate, n_box = len(half), len(box_centre)
+    middle, inward, outward, extent = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0)]
+    for axis, sign in ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0)):
+        side = sign * plates.rot_enu_from_mirror[:, :, axis]
+        middle.append(plates.centre_enu_m + half[:, axis, None] * side)
+        inward.append(-side)
+        outward.append(plates.rot_enu_from_mirror[:, :, 2])
+        extent.append(2.0 * half[:, 1 - axis])
+    order = [np.arange(4 * n_plate).reshape(4, n_plate).T.ravel()]
+    for along, first, second in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        for one, other in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+            a, b = one * boxes.rot_enu_from_box[:, :, first], other * boxes.rot_enu_from_box[:, :, second]
+            middle.append(box_centre + 0.5 * (boxes.size_m[:, [first]] * a + boxes.size_m[:, [second]] * b))
+            inward.append(-b)
+            outward.append(a)
+            extent.append(boxes.size_m[:, along])
+    order.append(4 * n_plate + np.arange(12 * n_box).reshape(12, n_box).T.ravel())
+    row = np.concatenate(order)
+    centre, within, out, size = (np.concatenate(one)[row] for one in (middle, inward, outward, extent))
+    if soil is not None:
+        above = (centre - [0.0, 0.0, soil.height_m]) @ geometry.unit(soil.normal_enu)
+        size = np.where(above > _FOOT_M, size, 0.0)
+    direction = np.cross(within, out)
+    return {
+        "edge_from": _solid(centre - 0.5 * size[:, None] * direction),
+        "edge_along": _solid(direction),
+        "edge_in": _solid(within),
+        "edge_out": _solid(out),
+        "edge_length": _solid(size),
+        "edge_wedge": np.repeat([2.0, 1.5], [4 * n_plate, 12 * n_box]),
+        "edge_thing": np.concatenate([np.repeat(np.arange(n_plate), 4), n_plate + np.repeat(np.arange(n_box), 12)]),
+    }
 
 
 def _complex(
