@@ -108,7 +108,8 @@ class Wanted(NamedTuple):
     hide: bool
     ground: bool
     specular: bool
-    diffracted: bool
+    box_edges: bool
+    plate_edges: bool
     own_plate: bool
     by_faces: bool
     faint: float
@@ -703,11 +704,12 @@ def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found)
                         off_face(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
                 for f in range(first_of_boxes, behind):
                     off_face(scene, wanted, receivers, found, m, t, f, here, spread[m])
-            if wanted.diffracted:
+            if wanted.box_edges:
+                round_edges(scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0])
+            if wanted.plate_edges:
                 for p in near:
                     if p != own:
                         round_edges(scene, wanted, receivers, found, m, t, 4 * p, 4 * p + 4)
-                round_edges(scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0])
                 if wanted.own_plate and own >= 0:
                     round_edges(scene, wanted, receivers, found, m, t, 4 * own, 4 * own + 4)
             if wanted.own_plate and own >= 0:

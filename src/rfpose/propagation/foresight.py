@@ -43,9 +43,10 @@ class Foresight:
     specular
         Rays off boxes and off plates within ``reach_m``, besides the mirror's own.
     diffracted
-        Rays bent by the edges of boxes and of plates within ``reach_m``, once.
+        Rays bent once, by edges: of ``none``, of ``boxes`` alone, or of ``all``, plates within ``reach_m`` and, with
+        ``own_plate``, the mirror's own among them.
     own_plate
-        Rays off the mirror's own plate, and with ``diffracted`` round its edges.
+        Rays off the mirror's own plate.
     reach_m
         Plates farther from a mirror's receivers than this hide, but turn nothing to it [m].
     faint
@@ -62,7 +63,7 @@ class Foresight:
     visibility: bool = True
     ground: bool = True
     specular: bool = True
-    diffracted: bool = True
+    diffracted: Literal["none", "boxes", "all"] = "all"
     own_plate: bool = True
     reach_m: float = 30.0
     faint: float = 1e-3
@@ -76,6 +77,8 @@ class Foresight:
             raise InvalidInputError(f"`reach_m` must not be negative, got {self.reach_m}")
         if not 0.0 <= self.faint < 1.0:
             raise InvalidInputError(f"`faint` must be from zero to below one, got {self.faint}")
+        if self.diffracted not in ("none", "boxes", "all"):
+            raise InvalidInputError(f"`diffracted` must be 'none', 'boxes' or 'all', got {self.diffracted!r}")
         if self.wedge not in ("uniform", "sionna"):
             raise InvalidInputError(f"`wedge` must be 'uniform' or 'sionna', got {self.wedge!r}")
         if self.antenna not in ("isotropic", "half_wave"):
@@ -139,7 +142,8 @@ def foresee(
         hide=wanted.visibility,
         ground=wanted.ground and surroundings.soil is not None,
         specular=wanted.specular,
-        diffracted=wanted.diffracted,
+        box_edges=wanted.diffracted != "none",
+        plate_edges=wanted.diffracted == "all",
         own_plate=wanted.own_plate,
         by_faces=wanted.wedge == "sionna",
         faint=wanted.faint,
