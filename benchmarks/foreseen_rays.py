@@ -3,7 +3,8 @@
 python benchmarks/foreseen_rays.py ../shared/data/traced [--variant edges] [--mhz 433] [--sun 0] [--place beside]
 
 The folder holds `paths/VARIANT_FREQMHz_sunK.npz` and the site's numbers in `tools/site_.py`. Rays are matched within
-each link by what they met and by their length.
+each link by what they met and by their length; diffracted ones with the tracer's own coefficients. With --moments: rays
+of the mirror's own plate against what the method of moments has for it (`nec/front_y_433MHz.npz`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import argparse
 import re
 import runpy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,57 @@ def print_phases(name: str, traced: Traced, rays: Rays, only: np.ndarray | None 
     print(f"  {name:23} {n_ray:6d} rays, phase of the sum off by rms {rms:.3f}, median {median:.4f} rad")
 
 
+OWN_PLATE_STEPS = {
+    "direct": Foresight(visibility=False, ground=False, specular=False, diffracted="none", own_plate=False),
+    "and visibility": Foresight(ground=False, specular=False, diffracted="none", own_plate=False),
+    "and its reflection": Foresight(ground=False, specular=False, diffracted="none"),
+    "and its edges": Foresight(ground=False, specular=False, reach_m=0.0, faint=0.0),
+    "edges, as the tracer": Foresight(ground=False, specular=False, reach_m=0.0, faint=0.0, wedge="sionna"),
+}
+
+
+def own_plate_by_moments(folder: Path, sun: int) -> dict[str, tuple[float, float]]:
+    """Return what is left of the moments' responses, relative, and the median phase off, by what is foreseen."""
+    traced = read(folder, "plates", 433, sun, "front")
+    stand = replace(traced.mirrors, own_plate=np.arange(len(traced.mirrors.pivot_enu_m)))
+    plates = PlatesStanding(
+        centre_enu_m=stand.pivot_enu_m,
+        rot_enu_from_mirror=stand.rot_enu_from_mirror,
+        size_m=np.full((len(stand.pivot_enu_m), 2), 2.0 * traced.site["HALF"]),
+    )
+    with np.load(folder / "nec" / "front_y_433MHz.npz") as file:
+        response = file["response"][1, sun, :, :, :, 0] / np.linalg.norm(file["free"])
+    place = stand.pivot_enu_m[:, None] + np.einsum("mab,mrb->mra", stand.rot_enu_from_mirror, stand.receiver_mirror_m)
+    way = traced.transmitter_enu_m - place[:, :, None]
+    distance = np.linalg.norm(way, axis=-1)
+    vertical = np.einsum("mab,mrta->mrtb", stand.rot_enu_from_mirror, theta_of(way))
+    seen = np.einsum("mab,mrta->mrtb", stand.rot_enu_from_mirror, way / distance[..., None])
+    beside = np.stack([-seen[..., 1], seen[..., 0], 0.0 * seen[..., 0]], axis=-1)
+    beside /= np.linalg.norm(beside, axis=-1, keepdims=True)
+    theirs = np.sum(response * np.stack([np.sum(theta_of(seen) * vertical, -1), np.sum(beside * vertical, -1)], -1), -1)
+    out = {}
+    for name, step in OWN_PLATE_STEPS.items():
+        rays = foresee(traced.transmitter_enu_m, np.full(10, 433e6), stand, Surroundings(plates=plates), step)
+        link, length = lengths_m(rays, stand, 10)
+        across = stand.rot_enu_from_mirror[link // theirs[0].size, :, 1]
+        field = np.sum(rays.field_enu * across, axis=1) * distance.ravel()[link]
+        ours = np.zeros(theirs.size, complex)
+        np.add.at(ours, link, field * np.exp(-2j * np.pi * 433e6 / SPEED_MPS * (length - distance.ravel()[link])))
+        scale = np.vdot(ours, theirs) / np.vdot(ours, ours)
+        left = np.linalg.norm(theirs.ravel() - scale * ours) / np.linalg.norm(theirs)
+        heard = np.minimum(np.abs(ours), np.abs(theirs.ravel())) > 0.05
+        phase = np.angle(scale * ours * theirs.ravel().conj())[heard]
+        out[name] = (float(left), float(np.median(np.abs(phase))))
+    return out
+
+
+def theta_of(way: np.ndarray) -> np.ndarray:
+    """Return unit vectors of growing polar angle."""
+    flat = np.hypot(way[..., 0], way[..., 1])
+    theta = np.stack([way[..., 2] * way[..., 0] / flat, way[..., 2] * way[..., 1] / flat, -flat], axis=-1)
+    return np.asarray(theta / np.linalg.norm(way, axis=-1, keepdims=True))
+
+
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -262,7 +314,13 @@ def main() -> None:
     parser.add_argument("--mhz", type=int)
     parser.add_argument("--sun", type=int)
     parser.add_argument("--place", choices=("front", "beside", "cal"))
+    parser.add_argument("--moments", action="store_true", help="only the mirror's own plate against moments")
     given = parser.parse_args()
+    if given.moments:
+        for sun in (0, 1) if given.sun is None else [given.sun]:
+            for name, (left, phase) in own_plate_by_moments(given.folder, sun).items():
+                print(f"sun {sun}: {name:22} leaves {left:.3f} of the response, median phase off {phase:.3f} rad")
+        return
     for variant in [given.variant] if given.variant else VARIANTS:
         for mhz in [given.mhz] if given.mhz else (433, 100):
             for sun in (0, 1) if given.sun is None else [given.sun]:
