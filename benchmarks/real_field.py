@@ -6,7 +6,8 @@
 
 Propagation is by programs that this project did not write: ray tables by Sionna RT and a receiver's own mirror by NEC-2
 (see `benchmarks/traced.py`). Tones of 0.75 and 7.5 MHz, 50 dB; eight mirrors and two suns, so sixteen mirror-frames a
-case; pivots as surveyed are 5 mm off, with that sigma; commanded postures 20 mrad off. Errors are of the mirror normal
+case; pivots as surveyed are 5 mm off, with that sigma; commanded postures 20 mrad off,
+those of neighbours 5. Errors are of the mirror normal
 in mrad; NEES is the mean squared error over the stated covariance, 1 where that is true. Silent: solved, and the error
 above its protection level or above 5 sigma. Tables of one's own (`scripts/trace_sionna.py`) and antenna patterns are
 looked for in the folders of ``--tables`` and ``--patterns``; cases that lack theirs are named.
@@ -18,7 +19,8 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,7 @@ Complex = npt.NDArray[np.complex128]
 SUNS = (0, 1)
 COMMANDED_OFF_RAD = 0.02
 PIVOT_OFF_M = 0.005
+NEIGHBOUR_OFF_RAD = 0.005
 SEED = 1
 RIM = r"D:ground"
 """The ground of the ray tracer ends; rays from its rim are no physics."""
@@ -180,12 +183,6 @@ class Case:
         What was measured, a sun a frame.
     normal_true_enu, normal_commanded_enu : (frame, heliostat, xyz)
         Where mirrors point, and where they were told to.
-    neighbour_enu_m : (neighbour, xyz)
-        Centres of the plates that carry no receiver.
-    neighbour_normal_enu : (frame, neighbour, xyz)
-        Their postures.
-    pattern
-        File of the antenna's pattern; None: the solver is told none.
     """
 
     spec: Spec
@@ -193,9 +190,6 @@ class Case:
     tones: TonePhases
     normal_true_enu: Array
     normal_commanded_enu: Array
-    neighbour_enu_m: Array
-    neighbour_normal_enu: Array
-    pattern: Path | None
 
     @property
     def name(self) -> str:
@@ -222,33 +216,50 @@ def cases(folder: str | Path, *, own: str | Path | None = None, patterns: str | 
     return [case for case in found if not isinstance(case, str)]
 
 
-def case_of(spec: Spec, folders: Folders) -> Case | str:
-    """Return a case, or what it lacks."""
+def case_of(spec: Spec, folders: Folders, suns: Sequence[int] = SUNS) -> Case | str:
+    """Return a case, or what it lacks; suns past the second need tables of one's own."""
     truth = _true_site(spec)
-    normal = traced.normals_enu(truth, SUNS)
+    normal = traced.normals_enu(truth, suns)
+    n_heliostat = len(truth.heliostat)
     lines = []
-    for frame, sun in enumerate(SUNS):
-        found = _lines(spec, folders, truth, sun, geometry.rot_enu_from_mirror(normal[frame]))
+    for frame, sun in enumerate(suns):
+        rot = geometry.rot_enu_from_mirror(normal[frame, :n_heliostat])
+        found = _lines(spec, folders, truth, sun, rot)
         if isinstance(found, str):
             return found
         lines.append(found)
-    pattern = None
+    told = _told_site(spec, truth)
     if spec.told != "none":
-        pattern = folders.pattern(spec.place, spec.mhz)
+        pattern = folders.pattern(spec.place, spec.mhz) if spec.told == "given" else None
         if pattern is None:
-            return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
+            return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz that was {spec.told}"
+        told = _with_antenna(told, pattern=str(pattern))
     rng = np.random.default_rng([SEED, 2])
-    neighbour = traced.neighbours_enu_m(truth)
+    off = np.full(normal.shape[1], NEIGHBOUR_OFF_RAD)
+    off[:n_heliostat] = COMMANDED_OFF_RAD
+    commanded = _tilted(normal, off, rng)
     return Case(
         spec=spec,
-        scenario=_told_site(spec, truth),
+        scenario=told.changed(posture={"csv": str(_posture_table(truth, commanded))}),
         tones=measured(truth, np.stack(lines), seed=SEED),
-        normal_true_enu=normal,
-        normal_commanded_enu=_tilted(normal, COMMANDED_OFF_RAD, rng),
-        neighbour_enu_m=neighbour,
-        neighbour_normal_enu=np.stack([traced.tracking_normal_enu(truth, neighbour, sun) for sun in SUNS]),
-        pattern=pattern,
+        normal_true_enu=normal[:, :n_heliostat],
+        normal_commanded_enu=commanded[:, :n_heliostat],
     )
+
+
+_SCRATCH = tempfile.TemporaryDirectory(prefix="rfpose-real-field-")
+
+
+def _posture_table(site: Scenario, normal: Array) -> Path:
+    """Write where mirrors were told to point (frame, mirror, xyz), as ``[posture] csv`` has it."""
+    names = [mirror.id for mirror in (*site.heliostat, *site.site.structures.plate)]
+    lines = ["id,frame,normal_e,normal_n,normal_u"]
+    for frame, normals in enumerate(normal):
+        lines += [",".join([name, str(frame), *map(repr, n)]) for name, n in zip(names, normals.tolist(), strict=True)]
+    handle, path = tempfile.mkstemp(suffix=".csv", dir=_SCRATCH.name)
+    with open(handle, "w") as file:
+        file.write("\n".join(lines) + "\n")
+    return Path(path)
 
 
 def _true_site(spec: Spec) -> Scenario:
@@ -257,14 +268,21 @@ def _true_site(spec: Spec) -> Scenario:
 
 
 def _told_site(spec: Spec, truth: Scenario) -> Scenario:
-    """Return the site as surveyed: pivots off, ground's constants off."""
+    """Return the site as surveyed: pivots off, ground's constants off, and no more structures than there are."""
     off = PIVOT_OFF_M * np.random.default_rng([SEED, 1]).standard_normal(truth.pivot_enu_m.shape)
+    # where rays were traced without the plates of the receivers' own mirrors, mirrors have none
+    has_plate = spec.antenna == "plate" or spec.variant in ("plates", "edges")
+    size = {} if has_plate else {"width_m": None, "height_m": None}
     told = truth.changed(
         heliostat=[
-            {**h.model_dump(exclude_none=True), "pivot_enu_m": tuple(p)}
+            {**h.model_dump(exclude_none=True), **size, "pivot_enu_m": tuple(p)}
             for h, p in zip(truth.heliostat, (truth.pivot_enu_m + off).tolist(), strict=True)
         ]
     )
+    if spec.variant in ("ground", "moments"):
+        told = told.changed(site={"structures": None})
+    if spec.antenna == "plate" and spec.told == "none":
+        told = _with_antenna(told, receiver="dipole")
     if spec.ground is None:
         return told
     permittivity, conductivity = traced.soil(1e6 * spec.mhz)
@@ -277,10 +295,15 @@ def _told_site(spec: Spec, truth: Scenario) -> Scenario:
     )
 
 
-def _tilted(normal: Array, angle_rad: float, rng: np.random.Generator) -> Array:
-    """Return normals turned by an angle, each to a side of its own."""
+def _with_antenna(site: Scenario, **table: str) -> Scenario:
+    # until pose `site` is there, nothing takes it
+    return site.changed(antenna=table) if "antenna" in Scenario.model_fields else site
+
+
+def _tilted(normal: Array, angle_rad: Array, rng: np.random.Generator) -> Array:
+    """Return normals (frame, mirror, xyz) turned by angles (mirror,), each to a side of its own."""
     aside = np.cross(normal, geometry.unit(rng.standard_normal(normal.shape)))
-    return geometry.unit(normal + np.tan(angle_rad) * geometry.unit(aside))
+    return geometry.unit(normal + np.tan(angle_rad)[:, None] * geometry.unit(aside))
 
 
 def _lines(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -> Complex | str:

@@ -9,7 +9,7 @@ same.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -38,12 +38,6 @@ PLACES_M = {
     "beside": [[1.12, 0.8, 0.05], [-1.12, 0.8, 0.05], [-1.12, -0.8, 0.05], [1.12, -0.8, 0.05]],
 }
 """Receivers in the mirror frame: 10 cm before the plate, and on stubs 12 cm beside its edges."""
-NEIGHBOURS_M = ((4.8, 0.3), (-4.8, -0.4), (0.5, 5.2), (-0.6, -5.4))
-"""The plates about each mirror: along the circle, and outwards from the tower."""
-TOWER_M = (6.0, 6.0, 46.0)
-"""Width, depth, height of the tower at the origin."""
-MIRROR_M = 2.0
-"""Side of a plate."""
 FIVE = (0, 2, 4, 6, 9)
 """The transmitters of the design with five: outer ring, inner ring, tower."""
 TABLE_2_ENU_M = np.array(
@@ -93,16 +87,20 @@ def site_of(rf_hz: float, place: str, *, transmitter_enu_m: Array | None = None)
     )
 
 
-def normals_enu(site: Scenario, suns: tuple[int, ...]) -> Array:
-    """Return (frame, heliostat, xyz) the normals with which the mirrors send the suns to the aim point."""
-    return np.stack([tracking_normal_enu(site, site.pivot_enu_m, sun) for sun in suns])
+def normals_enu(site: Scenario, suns: Iterable[int]) -> Array:
+    """Return (frame, mirror, xyz) the normals with which heliostats, then plates, send suns to the aim point."""
+    pivot = np.array([mirror.pivot_enu_m for mirror in (*site.heliostat, *site.site.structures.plate)])
+    to_aim = np.asarray(site.site.aim_enu_m) - pivot
+    toward = [geometry.enu_from_azimuth_elevation(*np.radians(sun_deg(sun))) for sun in suns]
+    return np.stack([geometry.bisector_enu(np.broadcast_to(one, to_aim.shape), to_aim) for one in toward])
 
 
-def tracking_normal_enu(site: Scenario, centre_enu_m: Array, sun: int) -> Array:
-    """Return (mirror, xyz) the normals that send a sun from mirrors to the aim point."""
-    sun_enu = geometry.enu_from_azimuth_elevation(*np.radians(SUNS_DEG[sun]))
-    to_aim = np.asarray(site.site.aim_enu_m) - centre_enu_m
-    return geometry.bisector_enu(np.broadcast_to(sun_enu, to_aim.shape), to_aim)
+def sun_deg(sun: int) -> tuple[float, float]:
+    """Return azimuth and elevation of the suns that tables are numbered by; further ones are drawn."""
+    if sun in SUNS_DEG:
+        return SUNS_DEG[sun]
+    rng = np.random.default_rng([99, sun])
+    return float(rng.uniform(90.0, 270.0)), float(rng.uniform(15.0, 65.0))
 
 
 def receivers_enu_m(site: Scenario, rot_enu_from_mirror: Array) -> Array:
@@ -112,14 +110,6 @@ def receivers_enu_m(site: Scenario, rot_enu_from_mirror: Array) -> Array:
         for h, rot in zip(site.heliostat, rot_enu_from_mirror, strict=True)
     ]
     return np.concatenate([*moving, site.calibration_enu_m])
-
-
-def neighbours_enu_m(site: Scenario) -> Array:
-    """Return (neighbour, xyz) the centres of the plates that carry no receiver: four about each mirror."""
-    outward = geometry.unit(site.pivot_enu_m * [1.0, 1.0, 0.0])
-    around = np.stack([-outward[:, 1], outward[:, 0], 0.0 * outward[:, 0]], axis=1)
-    place = [site.pivot_enu_m + a * around + b * outward for a, b in NEIGHBOURS_M]
-    return np.stack(place, axis=1).reshape(-1, 3)
 
 
 def soil(rf_hz: float) -> tuple[float, float]:
