@@ -1,40 +1,24 @@
 """Trace the rays of a site by Sionna RT, and write ray tables (docs/ray-tables.md) for `rfpose simulate`.
 
-    python scripts/trace_sionna.py site.toml surroundings.toml -o tables/ --frames 0,1
+    python scripts/trace_sionna.py site.toml -o tables/ --frames 0,1
 
 writes ``tables/site_frame0.npz`` and so on: the rays from every transmitter to every receiver of the scenario, in the
-postures that its ``[simulation]`` gives a frame. ``--what`` leaves things out: ``direct`` alone, ``ground`` too,
-``field`` (boxes and plates, too), ``plates`` (and the mirrors' own), ``edges`` (and first-order diffraction), ``open``
-(edges, without the plates of mirrors that carry receivers: what to weigh with patterns that hold the own plate).
+postures that its ``[simulation]`` gives a frame. What stands there is the scenario's: ``[site.structures]``, the
+outlines of mirrors (``width_m``, ``height_m``), and the ground of ``[reflection]`` where that is a ``fresnel`` one.
+``--what`` leaves things out: ``direct`` alone, ``ground`` too, ``field`` (boxes and plates, too), ``plates`` (and those
+of mirrors with receivers), ``edges`` (and first-order diffraction), ``open`` (edges, without the plates of mirrors with
+receivers: what to weigh with patterns that hold the own plate).
 
 Needs the extra ``trace`` (Sionna RT) and LLVM 19: Debian's package ``libllvm19``; elsewhere DRJIT_LIBLLVM_PATH names
-the library. The surroundings:
-
-    mirror_m = [2.0, 2.0]            # width and height of the heliostats' plates
-    [ground]                         # without it no ground
-    permittivity = 15.0
-    conductivity_s_per_m = 0.009
-    [[box]]                          # upright, its sides to the east and north
-    id = "tower"
-    base_enu_m = [0.0, 0.0, 0.0]
-    size_m = [6.0, 6.0, 46.0]
-    permittivity = 5.24
-    conductivity_s_per_m = 0.024
-    [[plate]]                        # of metal, as wide and high as the mirrors
-    id = "H01n0"
-    centre_enu_m = [20.0, 4.8, 2.0]
-    normal_enu = [0.0, 0.0, 1.0]     # without it, it sends the sun to the aim point as heliostats do
-
-Amplitudes hold λ/4πd and no propagation phase. Lengths are exact: image rays' by images in double precision, diffracted
-ones' along their points. What ray tracing cannot tell is said in docs/ray-tables.md.
+the library. What ray tracing cannot tell is said in docs/ray-tables.md.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 import tempfile
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,8 +29,11 @@ import numpy.typing as npt
 
 import rfpose as rf
 from rfpose import geometry
-from rfpose.errors import RfposeError
+from rfpose.errors import InvalidInputError, RfposeError, ScenarioError
 from rfpose.files import claim
+from rfpose.pipeline.postures import commanded_normals
+from rfpose.scenario import Box
+from rfpose.truth import Truth
 
 Array = npt.NDArray[np.float64]
 
@@ -59,7 +46,7 @@ THICK_M = 1000.0
 BASE_M = 0.01
 """Boxes begin so far above the ground, where faces would coincide."""
 SAMPLES = {"direct": 100_000, "ground": 100_000}
-_METAL = (1.0, 1e7)
+METAL = (1.0, 1e7)
 _REFLECTED, _DIFFRACTED = 1, 8
 
 
@@ -81,74 +68,80 @@ def plate(name: str, centre: Array, rot: Array, size_m: Iterable[float]) -> Thin
     """Return a metal rectangle."""
     u, v = (0.5 * s * rot[:, k] for k, s in enumerate(size_m))
     corners = np.array([centre - u - v, centre + u - v, centre + u + v, centre - u + v])
-    return Thing(name, corners, [(0, 1, 2), (0, 2, 3)], _METAL, [(centre, rot[:, 2])])
+    return Thing(name, corners, [(0, 1, 2), (0, 2, 3)], METAL, [(centre, rot[:, 2])])
 
 
-def box(name: str, base: Array, size: Array, material: tuple[float, float]) -> Thing:
+def box(standing: Box) -> Thing:
     """Return an upright box."""
-    ring = 0.5 * size[:2] * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    corners = [base + np.array([x, y, z]) for z in (BASE_M, size[2]) for x, y in ring]
+    base, size = np.array(standing.base_enu_m), np.array(standing.size_m)
+    sine, cosine = np.sin(np.radians(standing.azimuth_deg)), np.cos(np.radians(standing.azimuth_deg))
+    axes = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    ring = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    corners = [
+        base + 0.5 * size[0] * a * axes[0] + 0.5 * size[1] * b * axes[1] + z * axes[2]
+        for z in (BASE_M, size[2])
+        for a, b in ring
+    ]
     triangles = [(4, 5, 6), (4, 6, 7)]
     for a in range(4):
         b = (a + 1) % 4
         triangles += [(a, b, b + 4), (a, b + 4, a + 4)]
-    faces = [(base + 0.5 * s * size[k] * np.eye(3)[k], np.eye(3)[k]) for k in (0, 1) for s in (-1.0, 1.0)]
-    return Thing(name, np.array(corners), triangles, material, [*faces, (base + size * np.eye(3)[2], np.eye(3)[2])])
+    faces = [(base + 0.5 * s * size[k] * axes[k], axes[k]) for k in (0, 1) for s in (-1.0, 1.0)]
+    faces.append((base + size[2] * axes[2], axes[2]))
+    return Thing(
+        standing.id, np.array(corners), triangles, (standing.permittivity, standing.conductivity_s_per_m), faces
+    )
 
 
-def level_ground(material: tuple[float, float]) -> Thing:
+def level_ground(material: tuple[float, float], height_m: float) -> Thing:
     """Return the ground, wide enough for its rim to be far."""
-    w = GROUND_HALF_WIDTH_M
-    corners = np.array([(-w, -w, 0), (w, -w, 0), (w, w, 0), (-w, w, 0)], np.float64)
-    return Thing(GROUND, corners, [(0, 1, 2), (0, 2, 3)], material, [(np.zeros(3), np.eye(3)[2])])
+    w, z = GROUND_HALF_WIDTH_M, height_m
+    corners = np.array([(-w, -w, z), (w, -w, z), (w, w, z), (-w, w, z)], np.float64)
+    return Thing(GROUND, corners, [(0, 1, 2), (0, 2, 3)], material, [(np.array([0.0, 0.0, z]), np.eye(3)[2])])
 
 
-def things_of(site: rf.Scenario, around: dict[str, Any], normals: dict[str, Array], what: str) -> list[Thing]:
-    """Return what stands on a site; ``normals`` are those of heliostats and plates by name."""
-    found: list[Thing] = []
-    if what == "direct":
+def things_of(site: rf.Scenario, normals: Array, what: str) -> list[Thing]:
+    """Return what stands on a site; ``normals`` (mirror, xyz) are those of heliostats, then plates."""
+    ground, found = site.reflection, []
+    if what != "direct" and ground.permittivity is not None:
+        found.append(level_ground((ground.permittivity, ground.conductivity_s_per_m), ground.height_m))
+    if what in ("direct", "ground"):
         return found
-    if "ground" in around:
-        found.append(level_ground(_material(around["ground"])))
-    if what == "ground":
-        return found
-    for one in around.get("box", []):
-        found.append(box(one["id"], np.array(one["base_enu_m"]), np.array(one["size_m"]), _material(one)))
-    standing = {one["id"]: np.array(one["centre_enu_m"]) for one in around.get("plate", [])}
-    if what in ("plates", "edges"):
-        for heliostat in site.heliostat:
-            standing[heliostat.id] = np.array(heliostat.pivot_enu_m) + heliostat.arm_m * normals[heliostat.id]
-    for name, centre in standing.items():
-        found.append(plate(name, centre, geometry.rot_enu_from_mirror(normals[name]), around["mirror_m"]))
+    found += [box(one) for one in site.site.structures.box]
+    with_own = what in ("plates", "edges")
+    mirrors = [*(site.heliostat if with_own else ()), *site.site.structures.plate]
+    for mirror, normal in zip(mirrors, normals[0 if with_own else len(site.heliostat) :], strict=True):
+        if mirror.width_m is not None and mirror.height_m is not None:
+            centre = np.array(mirror.pivot_enu_m) + mirror.arm_m * normal
+            rot = geometry.rot_enu_from_mirror(normal)
+            found.append(plate(mirror.id, centre, rot, (mirror.width_m, mirror.height_m)))
     return found
 
 
-def _material(table: dict[str, Any]) -> tuple[float, float]:
-    return float(table["permittivity"]), float(table.get("conductivity_s_per_m", 0.0))
-
-
-def normals_by_name(site: rf.Scenario, around: dict[str, Any], truth: Any, frame: int) -> dict[str, Array]:
-    """Return the normals of heliostats and plates in a frame."""
-    found = dict(zip(site.heliostat_ids, truth.normal_enu[frame], strict=True))
-    plates = around.get("plate", [])
-    moving = [one for one in plates if "normal_enu" not in one]
-    found |= {one["id"]: geometry.unit(one["normal_enu"]) for one in plates if "normal_enu" in one}
-    if moving:
-        # what heliostats without receivers do is what the simulator has heliostats do
-        field_ = site.with_field([one["centre_enu_m"] for one in moving], ids=[one["id"] for one in moving])
-        normal = rf.simulate(field_, seed=0).truth.normal_enu[frame]
-        found |= dict(zip((one["id"] for one in moving), normal, strict=True))
-    return found
+def mirrors_point(site: rf.Scenario, truth: Truth, frame: int) -> Array:
+    """Return (mirror, xyz) normals of heliostats as simulated, then of plates as they were told."""
+    unix_s = truth.frame_start_index / float(site.radio.sample_rate)
+    told = commanded_normals(site, unix_s, simulated=True)[frame]
+    normals = np.concatenate([truth.normal_enu[frame], told[len(site.heliostat) :]])
+    lost = [
+        p.id for p, n in zip(site.site.structures.plate, normals[len(site.heliostat) :], strict=True) if n[0] != n[0]
+    ]
+    if lost:
+        raise ScenarioError(f"plate `{lost[0]}` has no posture in frame {frame}; give its `normal_enu`, or a sun")
+    return normals
 
 
 # -- Sionna RT -----------------------------------------------------------------------------------------------
 
 
-def trace(site: rf.Scenario, around: dict[str, Any], frame: int, what: str = "edges") -> dict[str, Any]:
+def trace(site: rf.Scenario, frame: int, what: str = "edges") -> dict[str, Any]:
     """Return the columns of a ray table; a row a ray."""
-    truth = rf.simulate(site, seed=0).truth
+    bare = site.changed(simulation=dict.fromkeys(("paths", "path_antenna", "paths_without")))
+    truth = rf.simulate(bare, seed=0).truth
+    if not 0 <= frame < len(truth.receiver_enu_m):
+        raise InvalidInputError(f"frame {frame} is none of the scenario's {len(truth.receiver_enu_m)} (from 0)")
     receiver = truth.receiver_enu_m[frame]
-    things = things_of(site, around, normals_by_name(site, around, truth, frame), what)
+    things = things_of(site, mirrors_point(site, truth, frame), what)
     paths, names = _solve(site, receiver, things, what)
     rows = [row for row in _rows(paths, names, things, site.transmitter_enu_m, receiver) if RIM not in row[-1]]
     rx, tx, a_theta, a_phi, length, theta_t, theta_r, phi_r, code = zip(*rows, strict=True)
@@ -269,7 +262,6 @@ def main() -> None:
     """Trace and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("scenario", type=Path)
-    parser.add_argument("surroundings", type=Path, nargs="?", help="TOML of what stands there; default: nothing")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the tables")
     parser.add_argument("--frames", default="0", help="numbers of frames, with commas")
     parser.add_argument("--what", choices=WHAT, default="edges")
@@ -277,21 +269,18 @@ def main() -> None:
     options = parser.parse_args()
     try:
         site = rf.load_scenario(options.scenario)
-        around = {} if options.surroundings is None else tomllib.loads(options.surroundings.read_text())
         options.output.mkdir(parents=True, exist_ok=True)
         for frame in map(int, options.frames.split(",")):
             path = options.output / f"{options.scenario.stem}_frame{frame}.npz"
             with claim(path, inputs=[options.scenario], force=options.force) as job:
-                table = trace(site, around, frame, options.what)
+                table = trace(site, frame, options.what)
                 job.write(path, _packed(table))
             print(f"{path}: {len(table['rx'])} rays of {len(site.receiver_ids)} x {len(site.transmitter)} links")
-    except (RfposeError, OSError, tomllib.TOMLDecodeError, KeyError) as error:
-        sys.exit(f"{error!r}" if isinstance(error, KeyError) else str(error))
+    except (RfposeError, OSError, ValueError) as error:
+        sys.exit(str(error))
 
 
 def _packed(table: dict[str, Any]) -> bytes:
-    import io
-
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **table)
     return buffer.getvalue()
