@@ -30,11 +30,13 @@ import numpy.typing as npt
 import traced
 from traced import SPEED_MPS, Table, antenna_isotropic, lines_of, measured, site_of
 
+import rfpose as rf
 from rfpose import geometry
+from rfpose.antenna import AntennaPattern, components, grid_directions
 from rfpose.dsp import TonePhases
 from rfpose.errors import RfposeError
 from rfpose.multilat import PoseStatus
-from rfpose.pipeline.formats.antenna_file import read_pattern
+from rfpose.pipeline.formats.antenna_file import read_pattern, write_pattern
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario
@@ -89,12 +91,15 @@ class Spec:
     variant
         Of the ray tables; ``moments``: direct rays, by the responses of the receiver's own mirror alone;
         ``everything``: ground, tower and neighbours, diffraction at their edges, and the antenna's pattern.
+    through_iq
+        Samples are simulated and measured; else lines are summed from the rays and get their noise.
     drop
         Rays whose code matches are left out.
     antenna
         ``isotropic``, or ``plate``: a dipole before its own plate, by moments.
     told
-        What the solver is told of the antenna: ``none``, ``given`` or ``learned``.
+        What the solver is told of the antenna: ``none``; ``given``, the very pattern; ``other mesh``, that of a coarser
+        mesh than the truth's, with its errors as they are stated; ``learned``.
     ground
         Factor on the ground's true constants in what the solver is told; None: that there is no ground.
     transmitters
@@ -109,6 +114,7 @@ class Spec:
     mhz: float = 433.0
     place: str
     variant: str
+    through_iq: bool = False
     drop: str = RIM
     antenna: str = "isotropic"
     told: str = "none"
@@ -133,6 +139,10 @@ def _specs() -> Iterator[Spec]:
             name=f"ground, tower, neighbours; {place}", place=place, variant="field", target_mrad=1.3 * factor,
             today="0/24",
         )  # fmt: skip
+        if place == "beside":
+            yield Spec(
+                name="the same through samples; beside", place=place, variant="field", through_iq=True, target_mrad=1.3,
+            )  # fmt: skip
         yield Spec(name=f"and own plates as rays; {place}", place=place, variant="plates", target_mrad=5.0 * factor)
         yield Spec(
             name=f"and plates and edges; {place}", place=place, variant="edges", target_mrad=5.0 * factor,
@@ -148,6 +158,11 @@ def _specs() -> Iterator[Spec]:
         (433.0, "beside", (None, 4.6, 6.0)),
         (433.0, "front", (None, 5.0, 6.5)),
     ):
+        if mhz == 433.0:
+            yield Spec(
+                name=f"everything, {mhz:.0f} MHz, pattern of another mesh; {place}", mhz=mhz, place=place,
+                variant="everything", antenna="plate", told="other mesh",
+            )  # fmt: skip
         for told, target in zip(("none", "given", "learned"), targets, strict=True):
             yield Spec(
                 name=f"everything, {mhz:.0f} MHz, pattern {told}; {place}", mhz=mhz, place=place, variant="everything",
@@ -230,10 +245,14 @@ def case_of(spec: Spec, folders: Folders, suns: Sequence[int] = SUNS) -> Case | 
         lines.append(found)
     told = _told_site(spec, truth)
     if spec.told != "none":
-        pattern = folders.pattern(spec.place, spec.mhz) if spec.told == "given" else None
-        if pattern is None:
-            return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz that was {spec.told}"
-        told = _with_antenna(told, pattern=str(pattern))
+        pattern = _told_pattern(spec, folders)
+        if isinstance(pattern, str):
+            return pattern
+        told = told.changed(antenna={"pattern": str(pattern)})
+    if spec.through_iq:
+        tones = _tones_through_iq(spec, folders, truth)
+    else:
+        tones = measured(truth, np.stack(lines), seed=SEED)
     rng = np.random.default_rng([SEED, 2])
     off = np.full(normal.shape[1], NEIGHBOUR_OFF_RAD)
     off[:n_heliostat] = COMMANDED_OFF_RAD
@@ -241,10 +260,60 @@ def case_of(spec: Spec, folders: Folders, suns: Sequence[int] = SUNS) -> Case | 
     return Case(
         spec=spec,
         scenario=told.changed(posture={"csv": str(_posture_table(truth, commanded))}),
-        tones=measured(truth, np.stack(lines), seed=SEED),
+        tones=tones,
         normal_true_enu=normal[:, :n_heliostat],
         normal_commanded_enu=commanded[:, :n_heliostat],
     )
+
+
+def _tones_through_iq(spec: Spec, folders: Folders, truth: Scenario) -> TonePhases:
+    """Simulate samples from the tables, and measure them."""
+    azimuth, elevation = zip(*(traced.sun_deg(sun) for sun in SUNS), strict=True)
+    site = truth.changed(
+        simulation={
+            "frame_count": len(SUNS),
+            "frame_interval_s": 60.0,
+            "sun_azimuth_deg": azimuth,
+            "sun_elevation_deg": elevation,
+            "paths": [str(folders.given / "paths" / f"{spec.variant}_{spec.mhz:.0f}MHz_sun{sun}.npz") for sun in SUNS],
+            "paths_without": ["D:ground"],
+            "reference_range_m": traced.REFERENCE_M,
+            "tone_snr_db": traced.SNR_DB,
+            "sample_format": "complex64",
+        }
+    )
+    return rf.process(rf.simulate(site, seed=SEED), estimator="correlator", pose="independent").tones
+
+
+def _true_pattern(spec: Spec, path: Path) -> AntennaPattern:
+    """Return the pattern that waves meet: that of the file, or that of its plate with a finer mesh."""
+    pattern = read_pattern(path).pattern
+    if spec.told != "other mesh":
+        return pattern
+    # the finer mesh is of one frequency and another grid: what it changes there, it changes all about
+    finer = read_pattern(path.with_name(f"{path.stem}_40cells.h5")).pattern
+    n_polar, n_azimuth = pattern.response.shape[2:4]
+    direction = grid_directions(n_polar, n_azimuth).reshape(-1, 3)
+    tables = [p.table(float(finer.frequency_hz[0])) for p in (finer, pattern)]
+    change = np.stack(
+        [tables[0].vector(direction, r) - tables[1].vector(direction, r) for r in range(pattern.n_receiver)]
+    )
+    moved = components(change.reshape(pattern.n_receiver, n_polar, n_azimuth, 3))
+    return replace(pattern, response=pattern.response + moved)
+
+
+def _told_pattern(spec: Spec, folders: Folders) -> Path | str:
+    """Return the file that the solver is told, or what is missing."""
+    path = folders.pattern(spec.place, spec.mhz)
+    if path is None or spec.told == "learned":
+        return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz that was {spec.told}"
+    if spec.told == "other mesh":
+        return path
+    # the truth is of the same mesh: what that mesh is off by is no error here
+    exact = read_pattern(path).pattern
+    told = Path(_SCRATCH.name) / f"exact_{path.name}"
+    write_pattern(told, replace(exact, sigma=np.zeros(exact.sigma.shape)), force=True)
+    return told
 
 
 _SCRATCH = tempfile.TemporaryDirectory(prefix="rfpose-real-field-")
@@ -282,7 +351,7 @@ def _told_site(spec: Spec, truth: Scenario) -> Scenario:
     if spec.variant in ("ground", "moments"):
         told = told.changed(site={"structures": None})
     if spec.antenna == "plate" and spec.told == "none":
-        told = _with_antenna(told, receiver="dipole")
+        told = told.changed(antenna={"receiver": "dipole"})
     if spec.ground is None:
         return told
     permittivity, conductivity = traced.soil(1e6 * spec.mhz)
@@ -293,11 +362,6 @@ def _told_site(spec: Spec, truth: Scenario) -> Scenario:
             "conductivity_s_per_m": conductivity * spec.ground,
         }
     )
-
-
-def _with_antenna(site: Scenario, **table: str) -> Scenario:
-    # until pose `site` is there, nothing takes it
-    return site.changed(antenna=table) if "antenna" in Scenario.model_fields else site
 
 
 def _tilted(normal: Array, angle_rad: Array, rng: np.random.Generator) -> Array:
@@ -321,7 +385,7 @@ def _lines(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -
     pattern = folders.pattern(spec.place, spec.mhz)
     if pattern is None:
         return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
-    return lines_of(site, table, traced.antenna_before_plate(site, table, rot, read_pattern(pattern).pattern))
+    return lines_of(site, table, traced.antenna_before_plate(site, table, rot, _true_pattern(spec, pattern)))
 
 
 def _table(spec: Spec, folders: Folders, sun: int) -> Table | str:
