@@ -48,6 +48,10 @@ class Multipath(Record):
     """Whether plates and boxes hide."""
     reach_m: NonNegative = 30.0
     """Plates farther from a mirror than this hide, but turn nothing to it."""
+    edges: Literal["all", "boxes"] = "all"
+    """Whose edges bend rays: of boxes and plates, or of boxes alone."""
+    wedge: Literal["uniform", "sionna"] = "uniform"
+    """Coefficients of diffraction: exact for metal half-planes; or those of Sionna RT, to compare with its tables."""
     floor: Annotated[float, Field(gt=0, le=10)] | None = None
     """Strength of what nothing foresees, relative to the direct ray; without it found from residuals."""
     tail: Annotated[float, Field(ge=1)] | None = None

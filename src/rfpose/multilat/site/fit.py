@@ -52,7 +52,8 @@ IntArray = npt.NDArray[np.int64]
 
 _MAX_STEPS = 40
 _FIRST_FLOOR = 0.05
-_TAILS = (3.0, 8.0, 30.0)
+_TAILS = (1.5, 2.0, 3.0, 8.0, 30.0)
+_FIRST_TAIL = 3.0
 _LEARN_ROUNDS = 15
 _LEARN_SETTLED = 0.03
 _LAST_ROUNDS = 2
@@ -187,7 +188,7 @@ class SiteSettings:
         Residuals do not make it smaller than this.
     tail
         Degrees of freedom ν of Student's t: the smaller, the less a link counts that is far off. None: the one of
-        3, 8 and 30 that makes the residuals likeliest.
+        1.5, 2, 3, 8 and 30 that makes the residuals likeliest.
     own_scale
         How many degrees of freedom the mirrors' common floor counts against each mirror's own residuals; infinity: all
         mirrors alike.
@@ -316,7 +317,7 @@ def fit_site(
     fit = _Fit(observations, knowledge, chosen)
     given = Common(
         floor=_FIRST_FLOOR if chosen.floor is None else chosen.floor,
-        tail=_TAILS[0] if chosen.tail is None else chosen.tail,
+        tail=_FIRST_TAIL if chosen.tail is None else chosen.tail,
         factor_scale=np.ones(len(RayKind)),
         soil_change=0j,
         soil_sigma=chosen.soil_sigma,
@@ -429,6 +430,10 @@ class _Told:
         return cls(np.full((n, len(RayKind), 2), np.nan), np.full((n, 2, 2), np.nan))
 
 
+def _soil_as(common: Common) -> dict[str, Any]:
+    return {"soil_change": common.soil_change, "soil_sigma": common.soil_sigma}
+
+
 def _t_constant(nu: float) -> float:
     """Of minus twice Student's log likelihood of one residual, what does not depend on the residual."""
     return float(np.log(nu * np.pi) - 2.0 * (gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu)))
@@ -501,14 +506,20 @@ class _Fit:
     def learn(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> Common:
         """Return what mirrors' residuals say of what all have in common (restricted maximum likelihood)."""
         prepared = self.prepare(voltages)
-        tails = _TAILS if self.settings.tail is None else (self.settings.tail,)
-        best = np.inf
-        for tail in tails:
-            cost, found = self._learn_with(prepared, state, rows, replace(common, tail=tail))
-            if not cost < best:
+        best, chosen = self._learn_with(prepared, state, rows, common)
+        if self.settings.tail is not None:
+            return chosen
+        at = _TAILS.index(common.tail)
+        # likelihood has one maximum over tails: downhill both ways, each from what was found beside it
+        for tails in (_TAILS[at + 1 :], _TAILS[:at][::-1]):
+            for tail in tails:
+                cost, found = self._learn_with(prepared, state, rows, replace(chosen, tail=tail, **_soil_as(common)))
+                if not cost < best:
+                    break
+                best, chosen = cost, found
+            if chosen.tail != common.tail:
                 break
-            best, chosen = cost, found
-        return common if np.isinf(best) else chosen
+        return chosen
 
     def _learn_with(self, prepared: _Prepared, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
         given = common

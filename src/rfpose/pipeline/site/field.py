@@ -30,8 +30,9 @@ _log = logging.getLogger(__name__)
 _VACUUM_PERMITTIVITY = 8.8541878128e-12
 _SOIL_STEP = 1e-3
 """Relative change of the permittivity by which rays' slope with it is found."""
-_CERTAIN = 0.01
-"""Relative uncertainty of the permittivity below which that matters no more."""
+_CERTAIN = 0.0
+"""Relative uncertainty of the permittivity at which nobody asks for its slope."""
+_SAME_POINT_M = 1e-4
 _SAME_PLACE_M = 0.05
 """A pattern's receivers may be this far from the scenario's."""
 
@@ -193,6 +194,8 @@ class SiteField:
             visibility=table.visibility,
             ground="ground" in table.foresee,
             specular="specular" in table.foresee,
+            diffracted=table.edges if "diffracted" in table.foresee else "none",
+            wedge=table.wedge,
             own_plate="own_plate" in table.foresee and not antenna.holds_own_plate,
             reach_m=table.reach_m,
             antenna=scenario.antenna.transmitter,
@@ -212,7 +215,10 @@ class SiteField:
         standing = commanded.copy()
         known = np.isfinite(rot).all(axis=(1, 2))
         standing[group.column[known]] = rot[known]
-        found = place_things(scenario, standing)
+        # a plate moves with its receivers, or they would stand before it where they do not
+        pivots = np.full((len(standing), 3), np.nan)
+        pivots[group.column] = pivot
+        found = place_things(scenario, standing, pivot_enu_m=pivots)
         stand = Stand(
             pivot_enu_m=pivot,
             rot_enu_from_mirror=rot,
@@ -224,8 +230,7 @@ class SiteField:
         link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
         at_receiver, transmitter = np.divmod(link, len(scenario.transmitter))
         mirror, receiver = np.divmod(at_receiver, group.places_m.shape[1])
-        at = pivot[mirror] + np.einsum("kab,kb->ka", rot[mirror], rays.place_mirror_m)
-        towards = geometry.unit(rays.source_enu_m - at) if rays.n_ray else rays.source_enu_m
+        towards = _towards(rays, pivot[mirror], rot[mirror], group.places_m[mirror, receiver])
         voltage, slope, error = self._antenna.receive(rays.field_enu, towards, rot[mirror], receiver, transmitter)
         vague = np.zeros(len(rays.first) - 1)
         np.add.at(vague, link, error**2)
@@ -251,6 +256,26 @@ class SiteField:
         with np.errstate(invalid="ignore", divide="ignore"):
             change = other.field_enu[k, strongest] / rays.field_enu[k, strongest] - 1.0
         return np.where(np.isfinite(change), change / _SOIL_STEP, 0.0)
+
+
+def _towards(rays: Rays, pivot: FloatArray, rot: FloatArray, receiver_mirror_m: FloatArray) -> FloatArray:
+    """(ray, xyz) unit vectors from receivers to where rays come from.
+
+    The last stretch of a ray from the mirror's own plate is the image of the one that the record holds, or comes from
+    the point of the edge that bent it.
+    """
+    if not rays.n_ray:
+        return rays.source_enu_m
+    at = pivot + np.einsum("kab,kb->ka", rot, rays.place_mirror_m)
+    out = geometry.unit(rays.source_enu_m - at)
+    off = rays.place_mirror_m - receiver_mirror_m
+    elsewhere = np.linalg.norm(off, axis=1) > _SAME_POINT_M
+    imaged = elsewhere & (np.hypot(off[:, 0], off[:, 1]) < _SAME_POINT_M)
+    bent = elsewhere & ~imaged
+    normal = rot[imaged][:, :, 2]
+    out[imaged] -= 2.0 * (out[imaged] * normal).sum(axis=1)[:, None] * normal
+    out[bent] = geometry.unit(np.einsum("kab,kb->ka", rot[bent], off[bent]))
+    return np.asarray(out)
 
 
 def _with_soil(things: Surroundings, change: complex, scenario: Scenario) -> Surroundings:
