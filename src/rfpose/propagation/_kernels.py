@@ -405,7 +405,7 @@ def in_beam(scene, f, image, a, spread):
     """Whether the line from an image to a passes face f within its half diagonal and ``spread``: no ray else."""
     d = minus(a, image)
     c = minus(at(scene.face_point, f), image)
-    g = along(c, -dot(c, d) / dot(d, d), d)
+    g = along(c, -dot(c, d) / max(dot(d, d), 1e-30), d)
     reach = math.sqrt(scene.face_half[f, 0] ** 2 + scene.face_half[f, 1] ** 2) + spread
     return dot(g, g) <= reach * reach
 

@@ -148,6 +148,7 @@ def test_a_half_wave_dipole_sends_most_to_the_horizon_and_nothing_up():
 
 SCREEN = plates(([10.0, 0.0, 2.0], [1.0, 0.0, 0.0], [2.0, 3.0]))
 HUT = boxes([10.0, 0.0, 0.0], [2.0, 4.0, 3.0], azimuth_deg=45.0)
+SQUARE = boxes([10.0, 3.0, 0.0], [2.0, 4.0, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -163,6 +164,8 @@ HUT = boxes([10.0, 0.0, 0.0], [2.0, 4.0, 3.0], azimuth_deg=45.0)
         (Surroundings(boxes=HUT), [20.0, 3.5, 2.0], False),  # a corner of it, as it is turned
         (Surroundings(boxes=HUT), [20.0, 6.5, 2.0], True),
         (Surroundings(boxes=HUT), [7.0, 0.0, 2.0], True),
+        (Surroundings(boxes=SQUARE), [20.0, 0.0, 2.0], True),  # along its wall, 1 m beside it
+        (Surroundings(boxes=SQUARE), [20.0, 6.1, 2.0], False),
     ],
 )
 def test_a_plate_and_a_box_hide_what_is_behind_them(things, place, seen):
@@ -370,6 +373,13 @@ def test_rays_of_the_own_plate_turn_with_the_mirror():
     assert images.sum() >= 5
     assert (own & ~images).sum() >= 5
     np.testing.assert_allclose(predicted[images], wanted[images], atol=1e-9)
+    link = ways_m(rays, stand, 3)[0]
+    receiver = (pivot + (place[0] + [0.0, 0.0, arm]) @ stand.rot_enu_from_mirror[0].T)[link // 3]
+    up = stand.rot_enu_from_mirror[0, :, 2]
+    mirrored = receiver - 2.0 * ((receiver - pivot) @ up - arm)[:, None] * up
+    np.testing.assert_allclose(
+        ways_m(rays, stand, 3)[1][images], np.linalg.norm(rays.source_enu_m - mirrored, axis=1)[images]
+    )
     still = ways_m(rays, stand, 3)[1]
     assert np.abs(wanted - still)[static & ~images].max() > 2e-5
     assert np.abs(predicted - wanted)[own].max() < 0.4 * np.abs(wanted - still)[own].max()
