@@ -109,7 +109,7 @@ class AntennaPattern:
     def table(self, frequency_hz: float) -> PatternTable:
         """Return the table of one frequency, from which directions are looked up.
 
-        Between the frequencies of the pattern the response is interpolated linearly.
+        Between the frequencies of the pattern the response is that of the parabola through the nearest three.
 
         Parameters
         ----------
@@ -128,14 +128,18 @@ class AntennaPattern:
                 f"the antenna pattern holds from {known[0] / 1e6:.6g} to {known[-1] / 1e6:.6g} MHz, and "
                 f"{wanted / 1e6:.6g} MHz is asked for; give a pattern of that frequency"
             )
-        at = float(np.interp(wanted, known, np.arange(len(known))))
-        i = min(int(at), max(len(known) - 2, 0))
-        share = at - i
-        response, sigma = self.response[i], self.sigma[i]
-        if share > 0.0:
-            response = (1.0 - share) * response + share * self.response[i + 1]
-            sigma = (1.0 - share) * sigma + share * self.sigma[i + 1]
+        # three, where there are so many: a short dipole's response grows with frequency, and bends
+        near = np.sort(np.argsort(np.abs(known - wanted), kind="stable")[:3])
+        response = np.tensordot(_lagrange(known[near], wanted), self.response[near], 1)
+        sigma = self.sigma[near].max(axis=0)
         return table_of(cartesian(response), sigma, self.axis_mirror)
+
+
+def _lagrange(known: FloatArray, wanted: float) -> FloatArray:
+    """Return the weights of values at known places in the polynomial through them."""
+    other = ~np.eye(len(known), dtype=bool)
+    ratio = np.divide(wanted - known, known[:, None] - known, out=np.ones(other.shape), where=other)
+    return np.asarray(ratio.prod(axis=1))
 
 
 def dipole_pattern(receiver_mirror_m: npt.ArrayLike, axis_mirror: npt.ArrayLike, frequency_hz: float) -> AntennaPattern:
