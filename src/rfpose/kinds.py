@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rfpose.errors import RecordingError
 
-__all__ = ["FORMAT_KINDS", "check_kind", "kind_of", "told_kind"]
+__all__ = ["FORMAT_KINDS", "check_kind", "is_hdf5", "kind_of", "told_kind"]
 
 FORMAT_KINDS = {
     "rfpose-iq": "recording",
@@ -58,6 +58,15 @@ def kind_of(path: str | Path) -> str | None:
     if re.match(r"\s*\{", text):
         return "truth" if '"heliostats"' in text else None
     return "scenario" if re.search(r"^\s*\[\[?(radio|transmitter|heliostat|tone)\]", text, re.MULTILINE) else None
+
+
+def is_hdf5(path: str | Path) -> bool:
+    """Whether a file begins as HDF5 does; false where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_HDF5)) == _HDF5
+    except (OSError, ValueError):
+        return False
 
 
 def _kind_of_hdf5(path: Path) -> str | None:

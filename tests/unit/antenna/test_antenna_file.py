@@ -136,6 +136,82 @@ def test_damaged_files_are_taken_or_refused_in_our_words(path, tmp_path, seed):
         assert broken.name in message, how
 
 
+def test_text_comes_back(pattern, tmp_path):
+    path = tmp_path / "plate.toml"
+    write_pattern(path, pattern, settings={"chamber": "north"})
+    found = read_pattern(path)
+    np.testing.assert_allclose(found.pattern.response, pattern.response, rtol=1e-7)  # NaN where NaN
+    np.testing.assert_allclose(found.pattern.sigma, pattern.sigma, rtol=1e-7)
+    np.testing.assert_array_equal(found.pattern.frequency_hz, pattern.frequency_hz)
+    assert found.made_by["chamber"] == "north"
+    assert inspect_file(path)["kind"] == "antenna"
+
+
+SMALL = """format = "rfpose-antenna"
+version = 1
+step_deg = 45
+[[receiver]]
+place_mirror_m = [0.0, 0.0, 0.1]
+axis_mirror = [0.0, 1.0, 0.0]
+rows = [  # Hz, polar, azimuth, theta and its phase, phi and its phase, sigma
+  [433e6, 45, 90, 0.5, 90, 0.25, 180, 0.01],
+]
+"""
+
+
+def test_a_table_written_by_hand(tmp_path):
+    path = tmp_path / "plate.toml"
+    path.write_text(SMALL)
+    pattern = read_pattern(path).pattern
+    np.testing.assert_allclose(pattern.response[0, 0, 1, 2], [0.5j, -0.25], atol=1e-12)
+    assert pattern.sigma[0, 0, 1, 2] == 0.01
+    assert np.isnan(pattern.response).any(axis=-1).sum() == 5 * 8 - 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("version = 1", "version = 2", "version 2"),
+        ("step_deg = 45", "step_deg = 50", "divide 180"),
+        ("step_deg = 45", "step_deg = 1e-300", "divide 180"),
+        ("step_deg = 45", "step_deg = 0.25", "one in a hundred"),
+        ("step_deg = 45", "", "step_deg"),
+        ("433e6, 45,", "433e6, 44,", "row 0: polar 44"),
+        ("45, 90", "45, 360", "azimuth 360"),
+        ("45, 90", "-45, 90", "polar -45"),
+        (" 0.01]", "]", "shape"),
+        (" 0.01]", " -1.0]", "sigma"),
+        ("0.5, 90", "nan, 90", "finite"),
+        ("axis_mirror", "axes", "no key is called"),
+        ("[0.0, 1.0, 0.0]", '"y"', "axis_mirror"),
+        ("[[receiver]]", "[[antenna]]", "no key is called"),
+        ("433e6", "0.0", "frequency_hz"),
+    ],
+)
+def test_text_that_is_no_pattern_is_refused(tmp_path, old, new, said):
+    path = tmp_path / "plate.toml"
+    path.write_text(SMALL.replace(old, new))
+    with pytest.raises(RecordingError, match=said) as caught:
+        read_pattern(path)
+    assert "plate.toml" in str(caught.value)
+
+
+def test_damaged_text_is_taken_or_refused_in_our_words(tmp_path):
+    rng = np.random.default_rng(8)
+    for k in range(60):
+        path = tmp_path / f"plate{k}.toml"
+        path.write_text(SMALL)
+        how = damage_bytes(path, rng)
+        try:
+            read_pattern(path).pattern.table(433e6)
+            message = path.name
+        except RfposeError as error:
+            message = str(error)
+        except Exception as error:
+            raise AssertionError(f"{k}, {how}: {error!r}") from error
+        assert path.name in message or "MHz is asked for" in message, how
+
+
 def test_another_kind_of_file_is_told(tmp_path):
     (tmp_path / "site.toml").write_text("[radio]\n")
     with pytest.raises(RecordingError, match="no antenna pattern, but a scenario"):

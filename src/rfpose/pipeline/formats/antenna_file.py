@@ -1,4 +1,4 @@
-"""The file of an antenna pattern: format ``rfpose-antenna``, HDF5, described in ``docs/antenna-patterns.md``."""
+"""The file of an antenna pattern: format ``rfpose-antenna``, HDF5 or TOML; see ``docs/antenna-patterns.md``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from rfpose import __version__
 from rfpose.antenna import AntennaPattern
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import write_atomically
+from rfpose.kinds import check_kind, is_hdf5
+from rfpose.pipeline.formats.antenna_text import read_text_pattern, text_of_pattern
 from rfpose.pipeline.formats.columns import Column, ColumnWriter, Labels, text_label
 from rfpose.pipeline.formats.hdf5_values import FileReader, opened
 
@@ -70,9 +72,9 @@ def write_pattern(
     Parameters
     ----------
     path
-        Of the file.
+        Text if it ends in .toml, else HDF5.
     pattern
-        What to write; responses are kept in single precision.
+        What to write; HDF5 keeps responses in single precision.
     settings
         What it was made with, by name.
     force
@@ -82,7 +84,14 @@ def write_pattern(
     ------
     RecordingError
         The file exists and may not be replaced, or cannot be written.
+    InvalidInputError
+        The pattern cannot be written as text.
     """
+    made_by = {"rfpose": __version__, **(settings or {})}
+    if Path(path).suffix == ".toml":
+        head = {"format": ANTENNA_FORMAT, "version": ANTENNA_VERSION, "made_by": made_by}
+        write_atomically(path, text_of_pattern(pattern, head).encode(), force=force)
+        return
     n_polar, n_azimuth = pattern.response.shape[2:4]
     values = {
         "polar_rad": np.linspace(0.0, np.pi, n_polar),
@@ -99,7 +108,7 @@ def write_pattern(
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110")) as file:
         file.attrs.update({"format": ANTENNA_FORMAT, "version": ANTENNA_VERSION, **_SAID})
-        file.create_group("made_by").attrs.update({"rfpose": __version__, **(settings or {})})
+        file.create_group("made_by").attrs.update(made_by)
         writer = ColumnWriter(file, labels)
         for name, column in _COLUMNS.items():
             writer.write(file, name, column, values[name] if name in values else getattr(pattern, name))
@@ -115,6 +124,10 @@ def read_pattern(path: str | Path) -> PatternFile:
         Missing, another kind of file or version, meant in another way, damaged, or no pattern: the place is named.
     """
     path = Path(path)
+    check_kind(path, wanted="antenna")
+    if not is_hdf5(path):
+        pattern, made_by = read_text_pattern(path, version=ANTENNA_VERSION)
+        return PatternFile(pattern=pattern, made_by=made_by)
     with opened(path, wanted="antenna", version=ANTENNA_VERSION, again=_AGAIN) as file:
         for name, meant in _SAID.items():
             if file.attrs.get(name) != meant:
