@@ -12,12 +12,14 @@ from rfpose.antenna.table import PatternTable, table_of
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import unit
+from rfpose.scenario import SPEED_OF_LIGHT_MPS
 
 __all__ = ["MISSING_SIGMA", "AntennaPattern", "dipole_pattern"]
 
 MISSING_SIGMA = 1.0
 """Error of the response where the table has none: as large as that of a dipole broadside in free space."""
 
+_PLACE_WAVELENGTHS = 0.05
 _FEWEST = (4, 6)
 _BEYOND = 0.02  # of a frequency: so far outside the table its end still holds
 _LARGEST = 1e3
@@ -105,6 +107,34 @@ class AntennaPattern:
     def n_receiver(self) -> int:
         """Receivers of a mirror."""
         return len(self.receiver_mirror_m)
+
+    def check_receivers(self, receiver_mirror_m: npt.ArrayLike) -> None:
+        """Refuse a pattern that is of other receivers than a mirror's, or has them in another order.
+
+        Parameters
+        ----------
+        receiver_mirror_m : (receiver, xyz)
+            The mirror's, from the plate's centre [m].
+
+        Raises
+        ------
+        InvalidInputError
+            Another number of receivers, or one that is farther from its place than a twentieth of the wavelength.
+        """
+        place = as_float_array("receiver_mirror_m", receiver_mirror_m, ("receiver", 3))
+        if len(place) != self.n_receiver:
+            raise InvalidInputError(
+                f"the antenna pattern is of {self.n_receiver} receivers, and the mirror has {len(place)}; give the "
+                "pattern of this type of mirror"
+            )
+        off_m = np.linalg.norm(place - self.receiver_mirror_m, axis=1)
+        limit_m = _PLACE_WAVELENGTHS * SPEED_OF_LIGHT_MPS / self.frequency_hz[-1]
+        if off_m.max() > limit_m:
+            r = int(np.argmax(off_m))
+            raise InvalidInputError(
+                f"receiver {r} of the antenna pattern stands at {self.receiver_mirror_m[r].tolist()}, the mirror's at "
+                f"{place[r].tolist()}; give the pattern of this type of mirror, its receivers in the same order"
+            )
 
     def table(self, frequency_hz: float) -> PatternTable:
         """Return the table of one frequency, from which directions are looked up.

@@ -148,6 +148,15 @@ def test_what_cannot_be_a_pattern_is_refused(change, said):
         dataclasses.replace(pattern, **change)
 
 
+def test_a_pattern_of_other_receivers_is_told():
+    pattern = dipole_pattern(PLACES, [0, 1, 0], 433e6)
+    pattern.check_receivers(PLACES + np.array([0.01, 0, 0]))
+    with pytest.raises(InvalidInputError, match="the mirror has 3"):
+        pattern.check_receivers(np.zeros((3, 3)))
+    with pytest.raises(InvalidInputError, match="same order"):
+        pattern.check_receivers(PLACES[::-1])
+
+
 @pytest.mark.parametrize(
     ("direction", "receiver", "said"),
     [
