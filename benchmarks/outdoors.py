@@ -2,10 +2,10 @@
 
     python benchmarks/outdoors.py TABLES     # open_433MHz_sun0.npz and so on, by scripts/trace_sionna.py --what open
 
-A study in numpy on ray tables of the site of `benchmarks/traced.py` (isotropic antennas beside the plates; ground, tower,
-neighbours, diffraction; own plates only where said), apart from the solver: carriers' phases are compared between a
-mirror's receivers, direct rays alone in the model, Student-t weights, a floor from the residuals. Starts are 20 mrad
-off, at 5.8 GHz 5; pivots 5 mm off, with that prior. No noise: reflections decide.
+A study in numpy on ray tables of the site of `benchmarks/traced.py` (isotropic antennas beside the plates; ground,
+tower, neighbours, diffraction; own plates only where said), apart from the solver: carriers' phases are compared
+between a mirror's receivers, direct rays alone in the model, Student-t weights, a floor from the residuals. Starts are
+20 mrad off, at 5.8 GHz 5; pivots 5 mm off, with that prior. No noise: reflections decide.
 
 **Stepped carriers.** A transmitter steps its carrier over a band, a megahertz a step; at each step every receiver
 measures its complex amplitude. A mirror's receivers share an oscillator, so that each step has one unknown phase in
