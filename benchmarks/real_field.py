@@ -32,13 +32,25 @@ from traced import SPEED_MPS, Table, antenna_isotropic, lines_of, measured, site
 
 import rfpose as rf
 from rfpose import geometry
-from rfpose.antenna import AntennaPattern, components, grid_directions
+from rfpose.antenna import (
+    AntennaPattern,
+    MirrorType,
+    PostureCarriers,
+    components,
+    grid_directions,
+    learn_pattern,
+)
 from rfpose.dsp import TonePhases
 from rfpose.errors import RfposeError
 from rfpose.multilat import PoseStatus
+from rfpose.multilat.site import Common
 from rfpose.pipeline.formats.antenna_file import read_pattern, write_pattern
 from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.mirrors import mirror_groups
+from rfpose.pipeline.postures import commanded_normals
+from rfpose.pipeline.site.field import SiteField, antenna_of
 from rfpose.pipeline.solve import solve
+from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
 
 __all__ = ["Case", "Folders", "cases"]
@@ -50,6 +62,9 @@ SUNS = (0, 1)
 COMMANDED_OFF_RAD = 0.02
 PIVOT_OFF_M = 0.005
 NEIGHBOUR_OFF_RAD = 0.005
+LESSON_OFF_RAD = 0.005
+FEWEST_LESSONS = 5
+MIRROR_M = 2.0
 SEED = 1
 RIM = r"D:ground"
 """The ground of the ray tracer ends; rays from its rim are no physics."""
@@ -266,6 +281,52 @@ def case_of(spec: Spec, folders: Folders, suns: Sequence[int] = SUNS) -> Case | 
     )
 
 
+def _learned_pattern(spec: Spec, folders: Folders) -> Path | str:
+    """Learn the pattern from other postures than the case's, believed to 5 mrad, and return its file."""
+    suns = [sun for sun in range(len(SUNS), 50) if folders.table("open", spec.mhz, sun) is not None]
+    if len(suns) < FEWEST_LESSONS:
+        return f"no {FEWEST_LESSONS} tables open_{spec.mhz:.0f}MHz_sun2 and on, to learn from"
+    told = Path(_SCRATCH.name) / f"learned_{spec.place}_{spec.mhz:.0f}MHz.h5"
+    if told.exists():
+        return told
+    lessons = case_of(replace(spec, told="given"), folders, suns)
+    if isinstance(lessons, str):
+        return lessons
+    site, (group,) = lessons.scenario, mirror_groups(lessons.scenario)
+    n_posture = len(suns) * len(site.heliostat)
+    rng = np.random.default_rng([SEED, 3])
+    believed = commanded_normals(site, np.full(len(suns), np.nan))
+    lesson_rad = np.full(len(site.heliostat), LESSON_OFF_RAD)
+    believed[:, : len(site.heliostat)] = _tilted(lessons.normal_true_enu, lesson_rad, rng)
+    rot = geometry.rot_enu_from_mirror(believed)
+    own_rot = rot[:, : len(site.heliostat)].reshape(-1, 3, 3)
+    pivot = np.tile(group.pivot_enu_m, (len(suns), 1))
+    # the pattern holds the own plate: whichever it is, no such rays are foreseen
+    foreseen = SiteField(site, group, rot, antenna_of(site))(
+        pivot,
+        own_rot,
+        Common(floor=0.05, tail=3.0, factor_scale=np.ones(len(RayKind)), soil_change=0j, soil_sigma=(0.0, 0.0)),
+    )
+    learned = learn_pattern(
+        PostureCarriers(
+            amplitude=group.of_mirrors(lessons.tones.carrier),
+            rays=foreseen.rays,
+            pivot_enu_m=pivot,
+            rot_enu_from_mirror=own_rot,
+            wavelength_m=SPEED_MPS / site.carrier_rf_hz,
+            rotation_sigma_rad=LESSON_OFF_RAD / np.sqrt(2.0),
+            pivot_sigma_m=PIVOT_OFF_M,
+        ),
+        MirrorType(
+            receiver_mirror_m=group.places_m[0], axis_mirror=np.array([0.0, 1.0, 0.0]), plate_m=(MIRROR_M, MIRROR_M)
+        ),
+        frequency_hz=site.radio.centre_frequency_hz,
+    )
+    print(f"learned {spec.place}, {spec.mhz:.0f} MHz: {n_posture} postures; {learned.report()}", file=sys.stderr)
+    write_pattern(told, learned.pattern)
+    return told
+
+
 def _tones_through_iq(spec: Spec, folders: Folders, truth: Scenario) -> TonePhases:
     """Simulate samples from the tables, and measure them."""
     azimuth, elevation = zip(*(traced.sun_deg(sun) for sun in SUNS), strict=True)
@@ -305,10 +366,12 @@ def _true_pattern(spec: Spec, path: Path) -> AntennaPattern:
 def _told_pattern(spec: Spec, folders: Folders) -> Path | str:
     """Return the file that the solver is told, or what is missing."""
     path = folders.pattern(spec.place, spec.mhz)
-    if path is None or spec.told == "learned":
-        return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz that was {spec.told}"
+    if path is None:
+        return f"no pattern {spec.place}_y_{spec.mhz:.0f}MHz"
     if spec.told == "other mesh":
         return path
+    if spec.told == "learned":
+        return _learned_pattern(spec, folders)
     # the truth is of the same mesh: what that mesh is off by is no error here
     exact = read_pattern(path).pattern
     told = Path(_SCRATCH.name) / f"exact_{path.name}"
