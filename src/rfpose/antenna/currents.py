@@ -8,6 +8,7 @@ import numpy as np
 
 from rfpose.antenna.pattern import AntennaPattern
 from rfpose.antenna.sphere import ComplexArray, components, grid_directions
+from rfpose.antenna.table import PatternTable
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import unit
@@ -18,6 +19,8 @@ _SPACING = 0.36
 """Of the plate's currents, in wavelengths: finer ones radiate nothing else (half a wavelength is the limit)."""
 _MOST_A_RECEIVER = 1200
 _EXTRA_DEGREE = 8
+_OPEN = 1e-6
+"""Of the mean square of a response (about 1): so far a pattern need not be met by currents."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,6 +156,35 @@ class Currents:
             for axis in np.eye(3)
         ]
         return np.stack(found, axis=1).reshape(*direction.shape, self.n_coefficient)
+
+    def dipoles(self) -> ComplexArray:
+        """Return the coefficients (receiver, element) of dipoles in free space."""
+        found = np.zeros((self.mirror.n_receiver, self.n_coefficient), np.complex128)
+        found[:, :3] = self.mirror.axis_mirror
+        return found
+
+    def nearest_to(self, table: PatternTable, plate_sigma: FloatArray) -> ComplexArray:
+        """Return the coefficients (receiver, element) whose pattern is nearest to a table.
+
+        Parameters
+        ----------
+        table
+            Of these receivers, at this frequency.
+        plate_sigma : (receiver, point)
+            How large the currents of the plate may be, where the pattern leaves it open.
+        """
+        grid = grid_directions(*self.grid())[1:-1]  # the poles would be there for each azimuth
+        direction = grid.reshape(-1, 3)
+        weight = np.sqrt(np.repeat(np.hypot(grid[..., 0], grid[..., 1]).ravel(), 3))
+        found = self.dipoles()
+        for r in range(self.mirror.n_receiver):
+            lengths = self.effective_lengths(r)[1:-1].reshape(-1, self.n_coefficient)
+            wanted = table.vector(direction, r).ravel() - lengths @ found[r]
+            sigma = np.concatenate([np.ones(3), plate_sigma[r], plate_sigma[r]])
+            rows = weight[:, None] * lengths * sigma
+            square = rows.conj().T @ rows + _OPEN * len(direction) * np.eye(self.n_coefficient)
+            found[r] += sigma * np.linalg.solve(square, rows.conj().T @ (weight * wanted))
+        return found
 
     def pattern(
         self, coefficient: ComplexArray, frequency_hz: float, sigma: FloatArray | None = None

@@ -37,6 +37,8 @@ _STRENGTHS = (0.1, 0.3)
 """Of a plate's current at `_NEAR_M` from the antenna, in dipoles; they fall with the distance."""
 _NEAR_M = 0.2
 _OWN_SIGMA = 0.3
+_STRENGTHS_NEAR, _OWN_SIGMA_NEAR = (0.01, 0.03, 0.1), 0.1
+"""The same about a pattern that is nearly known."""
 _FIXED = 1e6
 _NEAR_RAD = np.radians(10.0)
 _UNSURE = 0.1
@@ -122,7 +124,7 @@ class LearnedPattern:
     floor
         What is left a link, relative to the direct field: mostly reflections that the rays lack.
     floor_held_out
-        The same in postures that were held out while learning.
+        The same in postures that were held out while learning; NaN: there were fewer than ten.
     floor_dipole
         The same with dipoles in free space for a pattern.
     strength
@@ -156,17 +158,21 @@ class LearnedPattern:
         area = np.sin(np.linspace(0.0, np.pi, n_polar))[:, None] * np.ones(self.heard.shape[2])
         unheard = [f"{np.average(rays == 0, weights=area):.0%}" for rays in self.heard]
         unsure = [f"{np.average(sigma > _UNSURE, weights=area):.0%}" for sigma in self.pattern.sigma[0]]
+        held_out = "too few to hold some out"
+        if np.isfinite(self.floor_held_out):
+            held_out = f"in postures held out {self.floor_held_out:.3f}, {self.explained:.0%} of the variance explained"
         return (
             f"{self.n_posture} postures, {self.n_link} links\n"
-            f"left of the direct field: {self.floor:.3f}, in postures held out {self.floor_held_out:.3f}, "
-            f"with lone dipoles {self.floor_dipole:.3f}: {self.explained:.0%} explained\n"
+            f"left of the direct field: {self.floor:.3f}, with lone dipoles {self.floor_dipole:.3f}; {held_out}\n"
             f"directions that no ray came from within 10 degrees of, by receiver: {', '.join(unheard)}; "
             f"with sigma above {_UNSURE:g}: {', '.join(unsure)}\n"
             "undetermined: a factor common to all receivers; a rotation common to all postures"
         )
 
 
-def learn_pattern(postures: PostureCarriers, mirror: MirrorType, *, frequency_hz: float) -> LearnedPattern:
+def learn_pattern(
+    postures: PostureCarriers, mirror: MirrorType, *, frequency_hz: float, start: AntennaPattern | None = None
+) -> LearnedPattern:
     """Learn the pattern of a type of mirror from carriers in postures that are roughly known.
 
     Parameters
@@ -177,11 +183,14 @@ def learn_pattern(postures: PostureCarriers, mirror: MirrorType, *, frequency_hz
         Receivers, dipoles and plate.
     frequency_hz
         Of the carriers [Hz]; the pattern is of this one.
+    start
+        A pattern that the true one is near to, as NEC gives it: fewer postures are enough. None: nothing is known.
 
     Raises
     ------
     InvalidInputError
-        No usable links, other receivers than the mirror's, or a plate too large to be learned.
+        No usable links, other receivers than the mirror's, a start of others or another frequency, or a plate too large
+        to be learned.
     """
     if postures.amplitude.shape[1] != mirror.n_receiver:
         raise InvalidInputError(
@@ -189,23 +198,21 @@ def learn_pattern(postures: PostureCarriers, mirror: MirrorType, *, frequency_hz
         )
     speed = float(np.mean(postures.wavelength_m)) * as_positive("frequency_hz", frequency_hz)
     currents = Currents.of(mirror, frequency_hz, speed_mps=speed)
+    prior = _Prior(currents.dipoles(), _OWN_SIGMA, _STRENGTHS)
+    if start is not None:
+        start.check_receivers(mirror.receiver_mirror_m)
+        near = currents.nearest_to(start.table(frequency_hz), _plate_sigma(currents, _STRENGTHS[-1]))
+        prior = _Prior(near, _OWN_SIGMA_NEAR, _STRENGTHS_NEAR)
     problem = _Problem(postures, currents, frequency_hz)
-    held = np.arange(problem.n_posture) % _HELD_OUT == _HELD_OUT - 1
-    few = problem.n_posture < 2 * _HELD_OUT
-    tried = {}
-    for strength in _STRENGTHS:
-        learned = problem.fit(_prior_sigma(currents, strength), problem.usable & (few | ~held[:, None, None]))
-        tried[strength] = problem.floor_of(learned.coefficient, problem.usable & (few | held[:, None, None]))
-    strength = min(tried, key=tried.__getitem__)
-    prior = _prior_sigma(currents, strength)
-    final = problem.fit(prior, problem.usable)
+    strength, floor_held_out = _chosen_strength(problem, prior)
+    final = problem.fit(prior.mean, prior.sigma(currents, strength), problem.usable)
     return LearnedPattern(
         pattern=currents.pattern(final.coefficient, frequency_hz, _sigma_of(currents, final.covariance)),
         coefficient=read_only(final.coefficient),
         covariance=read_only(final.covariance),
         floor=final.floor,
-        floor_held_out=tried[strength],
-        floor_dipole=problem.floor_of(problem.start, problem.usable),
+        floor_held_out=floor_held_out,
+        floor_dipole=problem.floor_of(currents.dipoles(), problem.usable),
         strength=strength,
         heard=read_only(problem.heard()),
         n_posture=int(problem.usable.any(axis=(1, 2)).sum()),
@@ -213,11 +220,40 @@ def learn_pattern(postures: PostureCarriers, mirror: MirrorType, *, frequency_hz
     )
 
 
-def _prior_sigma(currents: Currents, strength: float) -> FloatArray:
-    """Return how far each element (receiver, element) may be from its start: the dipole's axis, and 0 on the plate."""
+@dataclass(frozen=True, slots=True)
+class _Prior:
+    """What is held likely before anything was heard: currents, and how far off they may be, for some strengths."""
+
+    mean: ComplexArray
+    own_sigma: float
+    strengths: tuple[float, ...]
+
+    def sigma(self, currents: Currents, strength: float) -> FloatArray:
+        """Return how far each element (receiver, element) may be from the mean."""
+        plate = _plate_sigma(currents, strength)
+        return np.concatenate([np.full((len(plate), 3), self.own_sigma), plate, plate], axis=1)
+
+
+def _plate_sigma(currents: Currents, strength: float) -> FloatArray:
+    """Return how large currents may be on the plate's points (receiver, point)."""
     away = np.linalg.norm(currents.place_mirror_m[None] - currents.mirror.receiver_mirror_m[:, None], axis=-1)
-    plate = strength * _NEAR_M / np.maximum(away, 0.5 * _NEAR_M)
-    return np.concatenate([np.full((len(away), 3), _OWN_SIGMA), plate, plate], axis=1)
+    return np.asarray(strength * _NEAR_M / np.maximum(away, 0.5 * _NEAR_M))
+
+
+def _chosen_strength(problem: _Problem, prior: _Prior) -> tuple[float, float]:
+    """Return the strength whose pattern foresees postures held out best, and their floor.
+
+    Where there are too few it is the largest, which claims least, and NaN.
+    """
+    if problem.n_posture < 2 * _HELD_OUT:
+        return prior.strengths[-1], float("nan")
+    held = (np.arange(problem.n_posture) % _HELD_OUT == _HELD_OUT - 1)[:, None, None]
+    tried = {}
+    for strength in prior.strengths:
+        learned = problem.fit(prior.mean, prior.sigma(problem.currents, strength), problem.usable & ~held)
+        tried[strength] = problem.floor_of(learned.coefficient, problem.usable & held)
+    best = min(tried, key=tried.__getitem__)
+    return best, tried[best]
 
 
 def _sigma_of(currents: Currents, covariance: ComplexArray) -> FloatArray:
@@ -265,8 +301,6 @@ class _Problem:
         self.carrier = np.where(self.usable, postures.amplitude, 0.0) / scale
         self._field = self._field / np.broadcast_to(scale, shape).reshape(-1)[self._link_of_ray][:, None]
         self.design = np.where(self.usable[..., None], self._design(), 0.0)
-        self.start = np.zeros((self.n_receiver, currents.n_coefficient), np.complex128)
-        self.start[:, :3] = currents.mirror.axis_mirror
         self._lengths = [currents.effective_lengths(r) for r in range(self.n_receiver)]
 
     def _take_rays(self, postures: PostureCarriers) -> None:
@@ -346,17 +380,25 @@ class _Problem:
     def _n_left(self, used: BoolArray) -> float:
         return float(used.sum() - used.any(axis=1).sum())
 
-    def fit(self, prior: FloatArray, used: BoolArray) -> _Fit:
-        """Return the currents by Gauss-Newton with Student weights, the floor found beside them."""
-        coefficient, floor = self.start, _FIRST_FLOOR
+    def fit(self, mean: ComplexArray, sigma: FloatArray, used: BoolArray) -> _Fit:
+        """Return the currents by Gauss-Newton with Student weights, the floor found beside them.
+
+        Parameters
+        ----------
+        mean, sigma : (receiver, element)
+            The prior.
+        used : (posture, receiver, transmitter)
+            Which links to take.
+        """
+        coefficient, floor = mean, _FIRST_FLOOR
         # as large as they please, all currents together would shrink: their unit is that dipoles are 1 in the mean
-        own = self.start.ravel() / self.n_receiver
-        information = np.diag(1.0 / prior.ravel() ** 2) + _FIXED * np.outer(own, own.conj())
+        own = self.currents.dipoles().ravel() / self.n_receiver
+        information = np.diag(1.0 / sigma.ravel() ** 2) + _FIXED * np.outer(own, own.conj())
         for _ in range(_MOST_ROUNDS):
             factor, left, weight = self._left(self.modelled(coefficient), used, floor)
             normal, slope = self._normal_equations(coefficient, factor, left, weight)
             covariance = np.linalg.inv(normal + information)
-            step = covariance @ (slope - information @ (coefficient - self.start).ravel())
+            step = covariance @ (slope - information @ (coefficient - mean).ravel())
             n_fitted = float(np.vdot(covariance, normal).real)  # as much of the coefficients as is not the prior's
             n_left = max(self._n_left(used) - n_fitted, _FEWEST_LEFT * self._n_left(used))
             found = _scatter(np.abs(left[used]) ** 2, n_left)
