@@ -379,6 +379,19 @@ def _told_pattern(spec: Spec, folders: Folders) -> Path | str:
     return told
 
 
+# what a table holds: the tracer finds edges by rays that hit beside them, so those of towers and few of far plates; and
+# its coefficients of diffraction are its own
+_TRACED: dict[str, dict[str, Any]] = {
+    "ground": {"foresee": ["ground"]},
+    "moments": {"foresee": []},
+    "field": {"foresee": ["ground", "specular"]},
+    "plates": {"foresee": ["ground", "specular", "own_plate"]},
+    "edges": {
+        "foresee": ["ground", "specular", "diffracted", "own_plate"], "edges": "boxes", "wedge": "sionna",
+    },
+}  # fmt: skip
+
+
 _SCRATCH = tempfile.TemporaryDirectory(prefix="rfpose-real-field-")
 
 
@@ -413,6 +426,7 @@ def _told_site(spec: Spec, truth: Scenario) -> Scenario:
     )
     if spec.variant in ("ground", "moments"):
         told = told.changed(site={"structures": None})
+    told = told.changed(multipath=_TRACED.get(spec.variant, _TRACED["edges"]))
     if spec.antenna == "plate" and spec.told == "none":
         told = told.changed(antenna={"receiver": "dipole"})
     if spec.ground is None:
