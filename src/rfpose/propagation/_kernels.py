@@ -258,9 +258,11 @@ def plates_hide(scene, a, b, skip, skip_too):
         j = math.floor((a[1] + f * d[1] - scene.y0) / scene.cell)
         if i == last_i and j == last_j:
             continue
-        last_i, last_j = i, j
         for column in range(max(0, i - 1), min(n_column, i + 2)):
-            first, behind = max(0, j - 1), min(n_row, j + 2)
+            first, behind = j - 1, j + 2
+            if abs(column - last_i) < 2:  # of a column about the step before only what is new
+                first, behind = (max(first, last_j + 2), behind) if j >= last_j else (first, min(behind, last_j - 1))
+            first, behind = max(0, first), min(n_row, behind)
             if first >= behind:
                 continue
             for q in range(scene.start[column, first], scene.start[column, behind]):
@@ -273,6 +275,7 @@ def plates_hide(scene, a, b, skip, skip_too):
                 g = along(c, -t, d)
                 if dot(g, g) <= scene.reach * scene.reach and plate_hides(scene, p, a, b):
                     return True
+        last_i, last_j = i, j
     return False
 
 
@@ -512,6 +515,21 @@ def edge_point(scene, e, source, end):
 
 
 @kernel
+def edge_in_reach(scene, e, source, end, spread):
+    """Whether the edge may turn a ray from a source to some point within ``spread`` of an end."""
+    along_edge = at(scene.edge_along, e)
+    a, b = minus(source, at(scene.edge_from, e)), minus(end, at(scene.edge_from, e))
+    za, zb = dot(a, along_edge), dot(b, along_edge)
+    ra, rb = length(along(a, -za, along_edge)), length(along(b, -zb, along_edge))
+    if ra + rb <= 2.0 * spread:
+        return True
+    z = (za * rb + zb * ra) / (ra + rb)
+    # by what the point moves at most along the edge: with the end's place along it, and with its distance from it
+    slack = spread * (1.0 + (abs(za - zb) + spread) / (ra + rb - spread))
+    return -slack < z < scene.edge_length[e] + slack
+
+
+@kernel
 def diffracted(scene, wanted, t, e, before, after, a, weak):
     """Whether transmitter t's ray bent by edge e reaches a, its field, the edge's point, the ways to that and from it.
 
@@ -642,28 +660,30 @@ def off_own_plate(scene, wanted, receivers, found, m, t, first, middle, spread):
 
 
 @kernel
-def round_edges(scene, wanted, receivers, found, m, t, first, behind):
+def round_edges(scene, wanted, receivers, found, m, t, first, behind, middle, spread):
     """Add the rays that edges ``first`` to ``behind`` bend, alone, and with the ground before or after."""
     origin = at(scene.transmitter, t)
-    for r in range(receivers.place.shape[1]):
-        a, place = receiver_at(receivers, m, r), at(receivers.place[m], r)
-        if math.isnan(a[0]):
-            continue
-        weak = wanted.faint / length(minus(a, origin))
-        for e in range(first, behind):
-            thing = scene.edge_thing[e]
-            for before, after in ((False, False), (True, False), (False, True)):
-                if (before or after) and not wanted.ground:
+    for e in range(first, behind):
+        thing = scene.edge_thing[e]
+        for before, after in ((False, False), (True, False), (False, True)):
+            if (before or after) and not wanted.ground:
+                continue
+            source = mirrored(scene, THE_GROUND, origin) if before else origin
+            if not edge_in_reach(scene, e, source, mirrored(scene, THE_GROUND, middle) if after else middle, spread):
+                continue
+            for r in range(receivers.place.shape[1]):
+                a, place = receiver_at(receivers, m, r), at(receivers.place[m], r)
+                if math.isnan(a[0]):
                     continue
+                weak = wanted.faint / length(minus(a, origin))
                 ok, field, q, near, far = diffracted(scene, wanted, t, e, before, after, a, weak)
                 if not ok:
                     continue
                 if thing == receivers.own[m]:  # its edges turn with the mirror
-                    source = mirrored(scene, THE_GROUND, origin) if before else origin
                     put(found, m, r, t, source, in_mirror(receivers, m, q), far, field, OWN_PLATE, thing)
                 else:
-                    source = mirrored(scene, THE_GROUND, q) if after else q
-                    put(found, m, r, t, source, place, near, field, DIFFRACTED, thing)
+                    seems = mirrored(scene, THE_GROUND, q) if after else q
+                    put(found, m, r, t, seems, place, near, field, DIFFRACTED, thing)
 
 
 @kernel
@@ -705,13 +725,15 @@ def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found)
                 for f in range(first_of_boxes, behind):
                     off_face(scene, wanted, receivers, found, m, t, f, here, spread[m])
             if wanted.box_edges:
-                round_edges(scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0])
+                round_edges(
+                    scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0], here, spread[m]
+                )
             if wanted.plate_edges:
                 for p in near:
                     if p != own:
-                        round_edges(scene, wanted, receivers, found, m, t, 4 * p, 4 * p + 4)
+                        round_edges(scene, wanted, receivers, found, m, t, 4 * p, 4 * p + 4, here, spread[m])
                 if wanted.own_plate and own >= 0:
-                    round_edges(scene, wanted, receivers, found, m, t, 4 * own, 4 * own + 4)
+                    round_edges(scene, wanted, receivers, found, m, t, 4 * own, 4 * own + 4, here, spread[m])
             if wanted.own_plate and own >= 0:
                 off_own_plate(scene, wanted, receivers, found, m, t, NO_FACE, here, spread[m])
                 if wanted.ground:
