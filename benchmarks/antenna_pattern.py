@@ -1,6 +1,6 @@
 """How well an antenna pattern is learned, from how many postures; and which NEC mesh agrees with which.
 
-    python benchmarks/antenna_pattern.py [PATTERN.h5] [--other OTHER.h5]
+    python benchmarks/antenna_pattern.py [PATTERN.h5] [--other OTHER.h5] [--save LEARNED.h5]
 
 Truth is a pattern in a file (the shipped one of receivers before a plate, 433 MHz). Carriers: site of
 data/table2_100m.toml, direct and ground ray (Fresnel, permittivity 15), of which the ground's is missing on a sixth of
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rfpose.antenna import AntennaPattern, MirrorType, PostureCarriers, dipole_pattern, learn_pattern
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.pipeline.formats.antenna_file import read_pattern
+from rfpose.pipeline.formats.antenna_file import read_pattern, write_pattern
 from rfpose.propagation import RayKind, Rays
 from rfpose.scenario import load_scenario
 
@@ -124,7 +124,8 @@ def apart(found: AntennaPattern, truth: AntennaPattern, frequency_hz: float) -> 
 @click.command()
 @click.argument("pattern", type=click.Path(path_type=Path), default=DATA / "antenna_front_433MHz.h5")
 @click.option("--other", type=click.Path(path_type=Path), help="Compare with this pattern, and learn nothing.")
-def main(pattern: Path, other: Path | None) -> None:
+@click.option("--save", type=click.Path(path_type=Path), help="Write what was learned from most postures.")
+def main(pattern: Path, other: Path | None, save: Path | None) -> None:
     """Print how well a pattern is learned, or how far two are apart."""
     truth = read_pattern(pattern).pattern
     frequency_hz = float(truth.frequency_hz[len(truth.frequency_hz) // 2])
@@ -144,6 +145,9 @@ def main(pattern: Path, other: Path | None) -> None:
             f"{n_posture:2d} postures x {N_MIRROR}: rms error {error:.3f}, {of_sigma:.2f} of sigma; left of the direct "
             f"field {learned.floor:.3f}, held out {learned.floor_held_out:.3f}, dipoles {learned.floor_dipole:.3f}"
         )
+    if save is not None:
+        settings = {"learned from": f"{n_posture} postures x {N_MIRROR} mirrors, by benchmarks/antenna_pattern.py"}
+        write_pattern(save, learned.pattern, settings=settings, force=True)
 
 
 if __name__ == "__main__":
