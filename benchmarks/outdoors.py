@@ -1,6 +1,6 @@
 """Print what would bring a real field's poses to 0.3 mrad: radio frequency, stepped carriers, antennas, transmitters.
 
-    python benchmarks/outdoors.py TABLES     # open_433MHz_sun0.npz and so on, by scripts/trace_sionna.py --what open
+    python benchmarks/outdoors.py TABLES     # ray tables, by benchmarks/real_field_tables.py
 
 A study in numpy on ray tables of the site of `benchmarks/traced.py` (isotropic antennas beside the plates; ground,
 tower, neighbours, diffraction; own plates only where said), apart from the solver: carriers' phases are compared
@@ -263,7 +263,7 @@ def errors_of(design: Design, fields: list[Field]) -> tuple[Array, Array]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path, help="ray tables, by scripts/trace_sionna.py")
+    parser.add_argument("folder", type=Path, help="ray tables, by benchmarks/real_field_tables.py")
     options = parser.parse_args()
     print("| MHz | design | band MHz | rms / median / max mrad | NEES |")
     print("|---|---|---|---|---|", flush=True)

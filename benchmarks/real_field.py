@@ -6,11 +6,11 @@
 
 Propagation is by programs that this project did not write: ray tables by Sionna RT and a receiver's own mirror by NEC-2
 (see `benchmarks/traced.py`). Tones of 0.75 and 7.5 MHz, 50 dB; eight mirrors and two suns, so sixteen mirror-frames a
-case; pivots as surveyed are 5 mm off, with that sigma; commanded postures 20 mrad off,
-those of neighbours 5. Errors are of the mirror normal
-in mrad; NEES is the mean squared error over the stated covariance, 1 where that is true. Silent: solved, and the error
-above its protection level or above 5 sigma. Tables of one's own (`scripts/trace_sionna.py`) and antenna patterns are
-looked for in the folders of ``--tables`` and ``--patterns``; cases that lack theirs are named.
+case; pivots as surveyed are 5 mm off, with that sigma; commanded postures 20 mrad off, those of neighbours 5. Errors
+are of the mirror normal in mrad; NEES is the mean squared error over the stated covariance, 1 where that is true.
+Silent: solved, and the error above its protection level or above 5 sigma. Tables of one's own
+(`benchmarks/real_field_tables.py`) and antenna patterns (`scripts/antenna_pattern.py`) are looked for in the folders of
+``--tables`` and ``--patterns``; cases that lack theirs are named.
 """
 
 from __future__ import annotations

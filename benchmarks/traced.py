@@ -117,6 +117,11 @@ def soil(rf_hz: float) -> tuple[float, float]:
     return 15.0, max(1e-3, 0.035 * (rf_hz / 1e9) ** 1.63)
 
 
+def concrete(rf_hz: float) -> tuple[float, float]:
+    """Return permittivity and conductivity [S/m] of the tower: ITU-R P.2040's concrete, carried on below 1 GHz."""
+    return 5.24, 0.0462 * (rf_hz / 1e9) ** 0.7822
+
+
 # -- directions ----------------------------------------------------------------------------------------------
 
 

@@ -43,6 +43,8 @@ GROUND, RIM = "ground", "D:ground"
 GROUND_HALF_WIDTH_M = 2000.0
 THICK_M = 1000.0
 """Materials are slabs to Sionna RT; a half-space is one that nothing comes back from."""
+LEAST_LOSS_S_PER_M = 3e-5
+"""Times the root of the permittivity: what goes through such a slab and back is down by e^11 then."""
 BASE_M = 0.01
 """Boxes begin so far above the ground, where faces would coincide."""
 SAMPLES = {"direct": 100_000, "ground": 100_000}
@@ -184,8 +186,12 @@ def _solve(site: rf.Scenario, receiver: Array, things: list[Thing], what: str) -
         objects = []
         for k, thing in enumerate(things):
             # its own materials are refused below 1 GHz, so each has numbers
+            permittivity, conductivity = thing.material
             material = RadioMaterial(
-                f"m{k}", thickness=THICK_M, relative_permittivity=thing.material[0], conductivity=thing.material[1]
+                f"m{k}",
+                thickness=THICK_M,
+                relative_permittivity=permittivity,
+                conductivity=max(conductivity, LEAST_LOSS_S_PER_M * permittivity**0.5),
             )
             mesh = _written(thing, Path(folder) / f"{k}.ply")
             objects.append(SceneObject(fname=str(mesh), name=thing.name, radio_material=material))
