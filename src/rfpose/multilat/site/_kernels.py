@@ -459,8 +459,9 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
             # priors: posture, mount, pivot, clocks
             turn_between(prior.commanded_rot[m], rot, off)
             for q in range(3):
-                normal[q, q] += prior.posture_info[m]
-                gradient[q, 0] += prior.posture_info[m] * off[q]
+                for p in range(3):
+                    normal[q, p] += prior.posture_info[m, q, p]
+                    gradient[q, 0] += prior.posture_info[m, q, p] * off[p]
                 normal[3 + q, 3 + q] += prior.pivot_info
                 gradient[3 + q, 0] += prior.pivot_info * (prior.pivot[m, q] - pivot[q])
             tilt = (rot[1, 0], -rot[0, 0])  # of the x axis out of the horizontal, by a turn about east and north
@@ -564,7 +565,9 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
         cost += quadratic
         turn_between(prior.commanded_rot[m], rot, off)
         for q in range(3):
-            cost += prior.posture_info[m] * off[q] ** 2 + prior.pivot_info * (prior.pivot[m, q] - pivot[q]) ** 2
+            for p in range(3):
+                cost += off[q] * prior.posture_info[m, q, p] * off[p]
+            cost += prior.pivot_info * (prior.pivot[m, q] - pivot[q]) ** 2
         out.cost[m] = cost
         out.pivot[m], out.rot[m] = pivot, rot
         out.scale[m] = scale

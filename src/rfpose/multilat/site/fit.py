@@ -56,6 +56,8 @@ _TAILS = (1.5, 2.0, 3.0, 8.0, 30.0)
 _FIRST_TAIL = 3.0
 _LEARN_ROUNDS = 15
 _LEARN_SETTLED = 0.03
+_LOST = 9.0
+"""A mirror whose stray field is so much stronger than the middle one's, in power, tells no more of it than that."""
 _LAST_ROUNDS = 2
 """How often rays are foreseen anew once that is learned."""
 _LEARN_MIRRORS = 200
@@ -72,6 +74,7 @@ _AMBIGUOUS_COST = 9.0
 """Two poses apart whose costs (twice the log likelihood) differ by less may each be the true one."""
 _APART = 0.15
 """Poses whose normals differ by more than this part of a wavelength over the lever are not the same."""
+_MOST_ROLL_RAD = 1.0
 _TELLING = 3
 """Fewer links than this beyond those that a pose takes confirm none."""
 
@@ -119,7 +122,9 @@ class SiteKnowledge:
     commanded_rot : (mirror, 3, 3)
         Orientation that control commanded, to ENU from the mirror frame; NaN: unknown.
     posture_sigma_rad : (mirror,)
-        How far orientations are from that, about each axis [rad]; infinity: it is where to begin, and no more.
+        How far orientations are from that, about axes across the normal [rad]; infinity: it is where to begin, and no
+        more. About the normal it is more where that stands near the zenith: there a small tilt is a large turn of a
+        mirror whose x axis keeps horizontal.
     roll_sigma_rad
         How well a mount holds the x axis horizontal [rad]; infinity: no such mount.
     clock_sigma_m
@@ -331,7 +336,7 @@ def fit_site(
     ]
     common, state, before = given, _State.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
-    state = _of_all_starts(fit, field_at, state, some, common)
+    state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, some, common), some, common)
     for k in range(chosen.rounds + _MORE_ROUNDS):
         if k >= chosen.rounds and abs(common.soil_change - before) < max(common.soil_sigma):
             break
@@ -340,7 +345,7 @@ def fit_site(
         common = replace(common, soil_sigma=chosen.soil_sigma)
         common = fit.learn(_field_of(field_at, state, some, common), state, some, common)
         state = fit.run(fit.prepare(_field_of(field_at, state, some, common)), state, some, common)
-    state = _of_all_starts(fit, field_at, state, everyone, common)
+    state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, everyone, common), everyone, common)
     for _ in range(_LAST_ROUNDS):
         state = fit.run(fit.prepare(_field_of(field_at, state, everyone, common)), state, everyone, common)
     return fit.outcome(state, known, common)
@@ -470,7 +475,7 @@ class _Fit:
             pivot=np.ascontiguousarray(knowledge.pivot_enu_m),
             pivot_info=pivot_info,
             commanded_rot=np.ascontiguousarray(knowledge.commanded_rot),
-            posture_info=np.ascontiguousarray(knowledge.posture_sigma_rad**-2.0),
+            posture_info=_posture_info(knowledge),
             roll_info=roll_info,
             clock_info=clock_info,
         )
@@ -541,7 +546,10 @@ class _Fit:
             return common
         floor = common.floor
         if self.settings.floor is None:
-            floor *= float(np.sqrt(total[ended].sum() / dof[ended].sum()))
+            # a mirror that is lost is not to be taken for a stronger field everywhere
+            ratio = total[ended] / dof[ended]
+            held = np.minimum(ratio, _LOST * np.median(ratio))
+            floor *= float(np.sqrt(np.average(held, weights=dof[ended])))
         square, share = np.nansum(told.factor[rows], axis=0).T
         change = np.sqrt((_FACTOR_PRIOR / common.factor_scale**2 + square) / (_FACTOR_PRIOR + share))
         scale = np.clip(common.factor_scale * change, _LEAST_FACTOR_SCALE, 1.0 / _LEAST_FACTOR_SCALE)
@@ -591,6 +599,24 @@ class _Fit:
         return replace(poses, protection_level_rad=np.where(lost, np.nan, level))
 
 
+def _roll_sigma_rad(knowledge: SiteKnowledge) -> FloatArray:
+    """(mirror,) how far orientations are off about their own normals."""
+    normal = knowledge.commanded_rot[:, :, 2]
+    sine = np.hypot(normal[:, 0], normal[:, 1])
+    return np.minimum(knowledge.posture_sigma_rad / np.maximum(sine, 1e-9), _MOST_ROLL_RAD)
+
+
+def _posture_info(knowledge: SiteKnowledge) -> FloatArray:
+    """(mirror, 3, 3) information on turns about east, north, up."""
+    normal = np.nan_to_num(knowledge.commanded_rot[:, :, 2])
+    along = normal[:, :, None] * normal[:, None, :]
+    across = knowledge.posture_sigma_rad[:, None, None] ** -2.0
+    roll = np.where(
+        np.isfinite(knowledge.posture_sigma_rad), np.nan_to_num(_roll_sigma_rad(knowledge), nan=1.0) ** -2.0, 0.0
+    )
+    return np.ascontiguousarray((np.eye(3) - along) * across + along * roll[:, None, None])
+
+
 def _redundancy(weight: FloatArray) -> IntArray:
     """(mirror,) links used less one a transmitter and six of the pose."""
     used = np.isfinite(weight)
@@ -600,10 +626,8 @@ def _redundancy(weight: FloatArray) -> IntArray:
 def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> _State:
     """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
     knowledge = fit.known
-    lever = float(np.nanmax(np.linalg.norm(knowledge.receiver_mirror_m, axis=-1), initial=0.0))
-    wavelength = 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
     finite = knowledge.posture_sigma_rad[np.isfinite(knowledge.posture_sigma_rad)]
-    turns = spread_starts(float(finite.max(initial=0.0)), max(lever, 1e-9), wavelength)[1:]
+    turns = spread_starts(float(finite.max(initial=0.0)), _lever_m(fit), _wavelength_m(fit))[1:]
     if not len(turns) or not len(rows):
         return state
     commanded = replace(state, pivot=knowledge.pivot_enu_m, rot=knowledge.commanded_rot)
@@ -612,19 +636,60 @@ def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, 
     turned = np.empty((3, 3))
     for w in turns:
         _kernels.turn(w, turned)
-        found = fit.run(near, replace(commanded, rot=turned @ knowledge.commanded_rot), rows, common)
-        off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
-        ended = (found.steps > 0) & (found.steps < _MAX_STEPS)
-        other = ended & (off > _APART * wavelength / lever)
-        better = (ended & ~(state.steps > 0)) | (other & (found.cost < state.cost))
-        alike = np.abs(found.cost - state.cost) < _AMBIGUOUS_COST
-        ambiguous = np.where(better, alike & other, state.ambiguous | (other & alike))
-        mine = rows[better[rows]]
-        if len(mine):
-            moved = state.with_poses_of(found, mine)
-            state = fit.run(fit.prepare(_field_of(field_at, moved, mine, common)), moved, mine, common)
-        state = replace(state, ambiguous=ambiguous)
+        state = _from(
+            fit, field_at, near, replace(commanded, rot=turned @ knowledge.commanded_rot), state, rows, common
+        )
     return state
+
+
+def _of_all_rolls(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> _State:
+    """Begin from elsewhere, too, where mirrors lie nearly flat, so that their roll is hardly known; keep the best."""
+    knowledge = fit.known
+    roll = _roll_sigma_rad(knowledge)
+    step = _wavelength_m(fit) / 3.0 / _lever_m(fit)
+    rows = rows[np.nan_to_num(roll[rows]) > step]
+    if not len(rows):
+        return state
+    commanded = replace(state, pivot=knowledge.pivot_enu_m, rot=knowledge.commanded_rot)
+    near = fit.prepare(_field_of(field_at, commanded, rows, common))
+    n = int(np.ceil(2.0 * float(roll[rows].max()) / step))
+    for k in (sign * j for j in range(1, n + 1) for sign in (1, -1)):
+        there = rows[np.abs(k) * step <= 2.0 * roll[rows] + step]
+        rot = knowledge.commanded_rot.copy()
+        sine, cosine = np.sin(k * step), np.cos(k * step)
+        # about the mirror's own normal: from the right
+        rot[there] = rot[there] @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        state = _from(fit, field_at, near, replace(commanded, rot=rot), state, there, common)
+    return state
+
+
+def _from(
+    fit: _Fit, field_at: FieldAt, near: _Prepared, start: _State, state: _State, rows: IntArray, common: Common
+) -> _State:
+    """Fit some mirrors from another start; return what stood, with what is better, and what is as good marked."""
+    apart_rad = _APART * _wavelength_m(fit) / _lever_m(fit)
+    found = fit.run(near, start, rows, common)
+    off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
+    mine = np.zeros(len(off), np.bool_)
+    mine[rows] = True
+    ended = mine & (found.steps > 0) & (found.steps < _MAX_STEPS)
+    other = ended & (off > apart_rad)
+    better = ended & ((state.steps <= 0) | (found.cost < state.cost))
+    alike = np.abs(found.cost - state.cost) < _AMBIGUOUS_COST
+    ambiguous = np.where(better & other, alike, state.ambiguous | (other & alike))
+    chosen = np.flatnonzero(better)
+    if len(chosen):
+        moved = state.with_poses_of(found, better)
+        state = fit.run(fit.prepare(_field_of(field_at, moved, chosen, common)), moved, chosen, common)
+    return replace(state, ambiguous=ambiguous)
+
+
+def _lever_m(fit: _Fit) -> float:
+    return max(float(np.nanmax(np.linalg.norm(fit.known.receiver_mirror_m, axis=-1), initial=0.0)), 1e-9)
+
+
+def _wavelength_m(fit: _Fit) -> float:
+    return 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
 
 
 @dataclass(frozen=True, slots=True)
