@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_fast, kernel_rows
+from rfpose.jit import kernel, kernel_rows
 
 _MAX_STEP_RAD = 0.05
 _SETTLED_SIGMAS = 2e-2
@@ -121,7 +121,7 @@ def turn_between(rot_to, rot_from, out):
         out *= np.arctan2(sine, cosine) / sine
 
 
-@kernel_fast
+@kernel
 def cholesky(a, n):
     """Replace the lower triangle of a by its Cholesky factor; false where it is not positive definite."""
     for j in range(n):
@@ -140,7 +140,7 @@ def cholesky(a, n):
     return True
 
 
-@kernel_fast
+@kernel
 def forward(lower, n, rhs, n_column):
     """Solve lower · x = rhs in place, column by column together."""
     for i in range(n):
@@ -233,7 +233,7 @@ def add_soil_errors(begin, end, heard, part, h, row_of, share, n, s):
     share[:n] = 0.0
 
 
-@kernel_fast
+@kernel
 def invert(lower, n, out):
     """Invert a lower triangle; above its diagonal ``out`` keeps what it had."""
     for i in range(n):
@@ -247,7 +247,7 @@ def invert(lower, n, out):
         out[i, i] = f
 
 
-@kernel_fast
+@kernel
 def square(a, n, n_par, normal, gradient):
     """Normal equations of whitened rows, the right-hand side in the last column."""
     normal[:] = 0.0
@@ -264,7 +264,7 @@ def square(a, n, n_par, normal, gradient):
             normal[q, p] = normal[p, q]
 
 
-@kernel_fast
+@kernel
 def tell(z_part, n, own, lower, a, n_par, normal_lower, whitened, seen):
     """What measurements say of one standardised factor error: its estimate, and how much of it they tell (0 to 1)."""
     u = 0.0
