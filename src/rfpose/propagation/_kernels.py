@@ -281,8 +281,8 @@ def plates_hide(scene, a, b, skip, skip_too):
 
 @kernel
 def free(scene, wanted, a, b, skip, skip_too):
-    """Whether nothing but two things, which touch the way's ends, hides b from a."""
-    if not wanted.hide:
+    """Whether nothing but two things, which touch the way's ends, hides b from a; no way is free."""
+    if not wanted.hide or (a[0] == b[0] and a[1] == b[1] and a[2] == b[2]):
         return True
     n_plate = scene.centre.shape[0]
     for i in range(scene.box_centre.shape[0]):
@@ -396,11 +396,11 @@ def reflected(scene, wanted, t, first, second, a, weak):
     field = times(1.0 / way, field)
     if size(field) < weak:
         return False, nothing
-    ok = free(scene, wanted, origin, p, thing, NOTHING)
-    if second == NO_FACE:
-        return ok and free(scene, wanted, p, a, thing, NOTHING), field
-    ok = ok and free(scene, wanted, p, q, thing, thing_too) and free(scene, wanted, q, a, thing_too, NOTHING)
-    return ok, field
+    # one call in a loop rather than three: LLVM would inline them all, and compile for minutes
+    for x, y, skip, skip_too in ((origin, p, thing, NOTHING), (p, q, thing, thing_too), (q, a, thing_too, NOTHING)):
+        if not free(scene, wanted, x, y, skip, skip_too):
+            return False, field
+    return True, field
 
 
 @kernel
@@ -561,12 +561,10 @@ def diffracted(scene, wanted, t, e, before, after, a, weak):
     if size(field) < weak:
         return False, nothing, q, near, far
     thing = scene.edge_thing[e]
-    ok = free(scene, wanted, g, q, thing, NOTHING) and free(scene, wanted, q, h, thing, NOTHING)
-    if ok and before:
-        ok = free(scene, wanted, origin, g, NOTHING, NOTHING)
-    if ok and after:
-        ok = free(scene, wanted, h, a, NOTHING, NOTHING)
-    return ok, field, q, near, far
+    for x, y, skip in ((g, q, thing), (q, h, thing), (origin, g, NOTHING), (h, a, NOTHING)):
+        if not free(scene, wanted, x, y, skip, NOTHING):
+            return False, field, q, near, far
+    return True, field, q, near, far
 
 
 # -- links -------------------------------------------------------------------------------------------------------------
@@ -649,10 +647,8 @@ def off_own_plate(scene, wanted, receivers, found, m, t, first, middle, spread):
         if math.isnan(a[0]):
             continue
         weak = wanted.faint / length(minus(a, origin))
-        if first == NO_FACE:
-            ok, field = reflected(scene, wanted, t, own, NO_FACE, a, weak)
-        else:
-            ok, field = reflected(scene, wanted, t, first, own, a, weak)
+        one, other = (own, NO_FACE) if first == NO_FACE else (first, own)
+        ok, field = reflected(scene, wanted, t, one, other, a, weak)
         if ok:
             # the receiver's image in the plate turns with the mirror, as the receiver does
             image = in_mirror(receivers, m, mirrored(scene, own, a))
@@ -704,11 +700,17 @@ def unturned(scene, wanted, receivers, found, m, t):
                 put(found, m, r, t, mirrored(scene, THE_GROUND, origin), place, 0.0, field, GROUND, ground)
 
 
+@kernel
+def face_of(scene, near, i):
+    """Face i of those about a mirror: of the plates near it, then of all boxes."""
+    return 1 + near[i] if i < len(near) else 1 + scene.centre.shape[0] + i - len(near)
+
+
 @kernel_rows
 def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found):
     """Find the rays of mirrors; ``middle`` (mirror, xyz) and ``spread`` (mirror,) are spheres about their receivers."""
-    n_plate, n_box = scene.centre.shape[0], scene.box_centre.shape[0]
-    first_of_boxes, behind = 1 + n_plate, 1 + n_plate + 6 * n_box
+    # each helper is called at one place: LLVM would inline it everywhere, and compile for minutes
+    n_plate, n_edge = scene.centre.shape[0], scene.edge_from.shape[0]
     for m in range(begin, end):
         found.n_ray[m] = 0
         here = at(middle, m)
@@ -716,31 +718,19 @@ def rays_of_mirrors(begin, end, scene, wanted, receivers, middle, spread, found)
             continue
         own = receivers.own[m]
         near = receivers.near[receivers.near_start[m] : receivers.near_start[m + 1]]
+        n_face = len(near) + 6 * scene.box_centre.shape[0]
         for t in range(scene.transmitter.shape[0]):
             unturned(scene, wanted, receivers, found, m, t)
-            if wanted.specular:
-                for p in near:
-                    if p != own:
-                        off_face(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
-                for f in range(first_of_boxes, behind):
+            for i in range(n_face if wanted.specular else 0):
+                f = face_of(scene, near, i)
+                if f != 1 + own:
                     off_face(scene, wanted, receivers, found, m, t, f, here, spread[m])
-            if wanted.box_edges:
-                round_edges(
-                    scene, wanted, receivers, found, m, t, 4 * n_plate, scene.edge_from.shape[0], here, spread[m]
-                )
-            if wanted.plate_edges:
-                for p in near:
-                    if p != own:
-                        round_edges(scene, wanted, receivers, found, m, t, 4 * p, 4 * p + 4, here, spread[m])
-                if wanted.own_plate and own >= 0:
-                    round_edges(scene, wanted, receivers, found, m, t, 4 * own, 4 * own + 4, here, spread[m])
-            if wanted.own_plate and own >= 0:
-                off_own_plate(scene, wanted, receivers, found, m, t, NO_FACE, here, spread[m])
-                if wanted.ground:
-                    off_own_plate(scene, wanted, receivers, found, m, t, THE_GROUND, here, spread[m])
-                if wanted.specular:
-                    for p in near:
-                        if p != own:
-                            off_own_plate(scene, wanted, receivers, found, m, t, 1 + p, here, spread[m])
-                    for f in range(first_of_boxes, behind):
-                        off_own_plate(scene, wanted, receivers, found, m, t, f, here, spread[m])
+            for i in range(-2, (n_face if wanted.specular else 0) if wanted.own_plate and own >= 0 else -2):
+                f = face_of(scene, near, i) if i >= 0 else NO_FACE if i == -2 else THE_GROUND
+                if f != 1 + own and (f != THE_GROUND or wanted.ground):
+                    off_own_plate(scene, wanted, receivers, found, m, t, f, here, spread[m])
+            for i in range(-1 if wanted.box_edges else 0, len(near) + 1 if wanted.plate_edges else 0):
+                p = near[i] if 0 <= i < len(near) else own
+                first, behind = (4 * n_plate, n_edge) if i < 0 else (4 * p, 4 * p + 4)
+                if i < 0 or p != own or (i == len(near) and wanted.own_plate and own >= 0):
+                    round_edges(scene, wanted, receivers, found, m, t, first, behind, here, spread[m])
