@@ -28,7 +28,7 @@ _FIRST_FLOOR = 1.0
 _LESS_A_ROUND = 1.6
 """The floor falls by no more than this a round: a pattern that is far off yet must not be trusted link by link."""
 _MOST_ROUNDS = 30
-_SETTLED = 2e-3
+_SETTLED, _SETTLED_FLOOR = 2e-3, 0.02
 _FEWEST_LEFT = 0.1
 """Of the equations: fewer left over after all that is fitted do not tell a floor."""
 _HELD_OUT = 5
@@ -132,6 +132,8 @@ class LearnedPattern:
     heard : (receiver, polar, azimuth)
         Rays that came from within ten degrees of each of the pattern's directions. Where there are none the pattern
         rests on what currents on a plate can do; its ``sigma`` tells how far.
+    settled
+        Whether pattern and floor had come to rest when the rounds were over.
     n_posture, n_link
         What was used.
     """
@@ -144,6 +146,7 @@ class LearnedPattern:
     floor_dipole: float
     strength: float
     heard: npt.NDArray[np.int64]
+    settled: bool
     n_posture: int
     n_link: int
 
@@ -161,8 +164,9 @@ class LearnedPattern:
         held_out = "too few to hold some out"
         if np.isfinite(self.floor_held_out):
             held_out = f"in postures held out {self.floor_held_out:.3f}, {self.explained:.0%} of the variance explained"
+        settled = "" if self.settled else "; DID NOT SETTLE, do not use it"
         return (
-            f"{self.n_posture} postures, {self.n_link} links\n"
+            f"{self.n_posture} postures, {self.n_link} links{settled}\n"
             f"left of the direct field: {self.floor:.3f}, with lone dipoles {self.floor_dipole:.3f}; {held_out}\n"
             f"directions that no ray came from within 10 degrees of, by receiver: {', '.join(unheard)}; "
             f"with sigma above {_UNSURE:g}: {', '.join(unsure)}\n"
@@ -215,6 +219,7 @@ def learn_pattern(
         floor_dipole=problem.floor_of(currents.dipoles(), problem.usable),
         strength=strength,
         heard=read_only(problem.heard()),
+        settled=final.settled,
         n_posture=int(problem.usable.any(axis=(1, 2)).sum()),
         n_link=int(problem.usable.sum()),
     )
@@ -270,11 +275,12 @@ def _sigma_of(currents: Currents, covariance: ComplexArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Currents, their covariance and the floor."""
+    """Currents, their covariance, the floor, and whether all of them settled."""
 
     coefficient: ComplexArray
     covariance: ComplexArray
     floor: float
+    settled: bool
 
 
 class _Problem:
@@ -317,8 +323,7 @@ class _Problem:
         turned = np.exp(-1j * self._wave_number * (length + rays.extra_m))
         self._link_of_ray = link
         self._receiver_of_ray = link // self.n_transmitter % self.n_receiver
-        self._direction_enu = towards / length[:, None]
-        self._direction = np.einsum("nji,nj->ni", rot, self._direction_enu)
+        self._direction = np.einsum("nji,nj->ni", rot, towards / length[:, None])
         self._field = np.einsum("nji,nj->ni", rot, rays.field_enu) * turned[:, None]
         self._place = rays.place_mirror_m
         self._sum = csr_array((np.ones(rays.n_ray), np.arange(rays.n_ray), rays.first), shape=(n_link, rays.n_ray))
@@ -390,7 +395,7 @@ class _Problem:
         used : (posture, receiver, transmitter)
             Which links to take.
         """
-        coefficient, floor = mean, _FIRST_FLOOR
+        coefficient, floor, settled = mean, _FIRST_FLOOR, False
         # as large as they please, all currents together would shrink: their unit is that dipoles are 1 in the mean
         own = self.currents.dipoles().ravel() / self.n_receiver
         information = np.diag(1.0 / sigma.ravel() ** 2) + _FIXED * np.outer(own, own.conj())
@@ -403,11 +408,12 @@ class _Problem:
             n_left = max(self._n_left(used) - n_fitted, _FEWEST_LEFT * self._n_left(used))
             found = _scatter(np.abs(left[used]) ** 2, n_left)
             coefficient = coefficient + step.reshape(coefficient.shape)
-            settled = np.linalg.norm(step) < _SETTLED * np.linalg.norm(coefficient) and abs(found / floor - 1.0) < 0.02
+            moved = float(np.linalg.norm(step) / np.linalg.norm(coefficient))
+            settled = moved < _SETTLED and abs(found / floor - 1.0) < _SETTLED_FLOOR
             floor = max(found, floor / _LESS_A_ROUND)
             if settled:
                 break
-        return _Fit(coefficient, _without_common_factor(np.asarray(covariance), coefficient.ravel()), floor)
+        return _Fit(coefficient, _without_common_factor(np.asarray(covariance), coefficient.ravel()), floor, settled)
 
     def _normal_equations(
         self, coefficient: ComplexArray, factor: ComplexArray, left: ComplexArray, weight: FloatArray

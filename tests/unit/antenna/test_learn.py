@@ -127,7 +127,10 @@ def test_the_report_tells_what_is_explained(learned):
     assert learned.floor_dipole > 0.2
     assert learned.explained > 0.95
     assert learned.n_posture == 60
+    assert learned.settled
     assert "undetermined" in learned.report()
+    assert "DID NOT SETTLE" not in learned.report()
+    assert "DID NOT SETTLE" in dataclasses.replace(learned, settled=False).report()
     # two rays a link, and a cap of ten degrees is 1/132 of the sphere
     assert 0.5 < learned.heard.mean() / (2 * 480 / 132) < 2.0
 
