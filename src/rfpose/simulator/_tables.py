@@ -216,7 +216,7 @@ class SiteTables:
 def _located(name: str, folder: Path | None) -> Path:
     """Return the file of a relative name: beside the scenario, else from where the program runs."""
     beside = Path(name) if folder is None else folder / name
-    return beside if beside.exists() else Path(name)
+    return Path(name) if Path(name).exists() and not beside.exists() else beside
 
 
 def _receiver_rows(table: RayTable, scenario: Scenario, position_enu_m: FloatArray, i_frame: int) -> IntArray:
