@@ -55,8 +55,8 @@ REFLECTION_NAMES = ("estimate", "ignore")
     type=click.Choice(POSE_NAMES),
     default="rigid",
     show_default=True,
-    help="How a mirror's normal follows: from all phases of its receivers at once, or from each receiver located on "
-    "its own, as published.",
+    help="How a mirror's normal follows: from all phases of its receivers at once; from the carriers among the "
+    "reflections that the site's geometry lets one expect; or from each receiver located on its own, as published.",
 )
 @click.option(
     "--reflection",
@@ -154,6 +154,10 @@ def _findings(summary: dict[str, Any]) -> list[str]:
     for name, c in summary.get("reflection", {}).get("coefficients", {}).items():
         value = "" if c["real"] is None else f": {c['real']:+.4f} {c['imag']:+.4f}j, sigma {c['sigma']:.2g}"
         out.append(f"reflection of {name} {c['status']}{value}")
+    site = summary.get("site", {})
+    if site.get("floor") is not None:
+        out.append(f"{site['disturbed']} of {site['links']} links hear more than is foreseen and count less")
+        out.append(f"field that nothing foresees, median: {site['floor']:.2g} of the direct one")
     delays = summary.get("delays", {})
     if delays.get("last_sigma_ps") is not None:
         out.append(f"receiver delays learned to {delays['last_sigma_ps']:.3g} ps, {delays['jumps']} jumps")

@@ -44,7 +44,7 @@ def normal_bound_rad(
     scenario
         Clocks, priors, reflecting planes.
     choice
-        The estimator.
+        The estimator; the bound of pose ``site`` is that of pose ``rigid``: what noise alone allows.
     noise
         Of every phase.
     normal_enu : (frame, heliostat, xyz)
@@ -58,7 +58,7 @@ def normal_bound_rad(
     coefficient : (reflector,), optional
         True reflection coefficients, complex; needed where ``choice`` has any.
     """
-    if choice.pose != "rigid":
+    if choice.pose == "independent":
         return _independent(scenario, noise, receiver_enu_m)
     start = frame_start_index
     time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])

@@ -149,7 +149,9 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     independent = _pose_table(poses, len(scenario.tone))
     found: RigidOutcome | SiteOutcome | None = None
     if choice.pose == "site":
-        found = solve_site_poses(tones, scenario, independent, sample_rate=rate_of(settings))
+        found = solve_site_poses(
+            tones, scenario, independent, sample_rate=rate_of(settings), simulated=truth is not None
+        )
     elif choice.pose == "rigid":
         found = solve_rigid_poses(
             tones,

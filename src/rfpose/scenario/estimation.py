@@ -43,8 +43,6 @@ class Reflection(Record):
     """Of model ``fresnel``: relative, real part."""
     conductivity_s_per_m: NonNegative = 0.0
     polarisation: Literal["vertical", "horizontal"] = "vertical"
-    coefficient_sigma: NonNegative = 0.3
-    """Of pose ``site``: how far the ground's coefficient may be off, relative, real and imaginary part."""
     scaled: bool = False
     """Model ``fresnel`` with a complex factor on it that is estimated."""
     height_m: float = 0.0

@@ -50,7 +50,7 @@ BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
-_MAX_STEPS = 40
+_MAX_STEPS = 100
 _FIRST_FLOOR = 0.05
 _TAILS = (1.5, 2.0, 3.0, 8.0, 30.0)
 _FIRST_TAIL = 3.0

@@ -23,12 +23,14 @@ from rfpose.pipeline.formats.result import (
     IntegrityTable,
     ReflectionTable,
     Result,
+    SiteTable,
     frame_time,
 )
 from rfpose.tables import write_csv
 
 __all__ = [
     "CSV_COLUMNS",
+    "DISTURBED",
     "EXPLAINED",
     "NEEDED_PROBABILITY",
     "count_reasons",
@@ -41,6 +43,8 @@ __all__ = [
 NEEDED_PROBABILITY = 1e-3
 """Residuals of the direct ray alone that are rarer than this say that a reflection is needed."""
 
+DISTURBED = 0.3
+"""A link that counts less than this, beside one without surprises, hears more than is foreseen."""
 EXPLAINED = (IntegrityStatus.EXCLUDED, IntegrityStatus.PRIOR_REJECTED, IntegrityStatus.AMBIGUOUS)
 """Where what was left out explains the residuals; elsewhere its names mean nothing."""
 
@@ -78,6 +82,8 @@ def summarise(result: Result) -> dict[str, Any]:
         summary["integrity"] = _summary_of_integrity(result, result.integrity)
     if result.reflection is not None:
         summary["reflection"] = _summary_of_reflection(result, result.reflection)
+    if result.site is not None:
+        summary["site"] = _summary_of_site(result.site)
     if result.delays is not None:
         summary["delays"] = _summary_of_delays(result.delays)
     if result.filtered is not None:
@@ -103,6 +109,17 @@ def _summary_of_integers(result: Result) -> dict[str, Any]:
     return {
         name: {IntegerMethod(code).reason: n for code, n in Counter(method[:, k].tolist()).most_common()}
         for k, name in enumerate(names)
+    }
+
+
+def _summary_of_site(table: SiteTable) -> dict[str, Any]:
+    weight, floor = table.weight[np.isfinite(table.weight)], table.floor[np.isfinite(table.floor)]
+    change = table.permittivity_change[np.isfinite(table.permittivity_change)]
+    return {
+        "links": weight.size,
+        "disturbed": int(np.count_nonzero(weight < DISTURBED)),
+        "floor": float(np.median(floor)) if floor.size else None,
+        "permittivity_change": float(change[0].real) if change.size else None,
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -12,20 +11,18 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.antenna import AntennaPattern, PatternTable, dipole_pattern, grid_directions
 from rfpose.checks import FloatArray
-from rfpose.errors import ScenarioError
+from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.multilat.site import Common, Voltages
 from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.mirrors import MirrorGroup
 from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, foresee
 from rfpose.propagation.site import place_things
-from rfpose.scenario import Scenario
+from rfpose.scenario import Heliostat, Scenario
 
 __all__ = ["ReceivingAntenna", "SiteField", "antenna_of"]
 
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
-
-_log = logging.getLogger(__name__)
 
 _VACUUM_PERMITTIVITY = 8.8541878128e-12
 _SOIL_STEP = 1e-3
@@ -33,8 +30,6 @@ _SOIL_STEP = 1e-3
 _CERTAIN = 0.0
 """Relative uncertainty of the permittivity at which nobody asks for its slope."""
 _SAME_POINT_M = 1e-4
-_SAME_PLACE_M = 0.05
-"""A pattern's receivers may be this far from the scenario's."""
 
 
 class ReceivingAntenna(Protocol):
@@ -152,26 +147,25 @@ class PatternAntenna:
         return (field * vector).sum(axis=1), out, sigma * np.linalg.norm(field, axis=1)
 
 
-def antenna_of(scenario: Scenario) -> ReceivingAntenna:
-    """Return the antennas of a scenario's mirrors, from ``[antenna]``.
+def antenna_of(scenario: Scenario, heliostat: Heliostat | None = None) -> ReceivingAntenna:
+    """Return the antennas of a heliostat's mirror, by default the first one's, from ``[antenna]``.
 
     Raises
     ------
     ScenarioError
-        A pattern of other receivers than the scenario's.
+        A pattern of other receivers than the mirror's.
     RecordingError
         The pattern's file is missing or damaged.
     """
     table = scenario.antenna
-    places = np.array(scenario.heliostat[0].receiver_mirror_m)
+    mirror = scenario.heliostat[0] if heliostat is None else heliostat
+    places = np.array(mirror.receiver_mirror_m)
     if table.pattern is not None:
         pattern = read_pattern(table.pattern).pattern
-        if pattern.n_receiver != len(places) or np.abs(pattern.receiver_mirror_m - places).max() > _SAME_PLACE_M:
-            raise ScenarioError(
-                f"{table.pattern}: is of receivers at {pattern.receiver_mirror_m.round(3).tolist()} m on the mirror, "
-                f"and those of scenario `{scenario.name}` are at {places.round(3).tolist()}; give the pattern of this "
-                "mirror"
-            )
+        try:
+            pattern.check_receivers(places)
+        except InvalidInputError as error:
+            raise ScenarioError(f"{table.pattern}, heliostat `{mirror.id}`: {error}") from error
         return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
     if table.receiver == "dipole":
         mean_hz = float(scenario.carrier_rf_hz.mean())

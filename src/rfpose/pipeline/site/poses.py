@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -26,11 +25,6 @@ from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
 
 __all__ = ["SiteOutcome", "check_site_solvable", "solve_site_poses"]
-
-_log = logging.getLogger(__name__)
-
-_LIGHT = 0.3
-"""A link that counts less than this, beside one without surprises, is said to be disturbed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +58,9 @@ def check_site_solvable(scenario: Scenario) -> None:
     scenario.need_rf_carriers("pose `site`")
 
 
-def solve_site_poses(tones: TonePhases, scenario: Scenario, cold: PoseTable, *, sample_rate: Fraction) -> SiteOutcome:
+def solve_site_poses(
+    tones: TonePhases, scenario: Scenario, cold: PoseTable, *, sample_rate: Fraction, simulated: bool
+) -> SiteOutcome:
     """Solve every mirror of every frame with the site in the model.
 
     Parameters
@@ -76,13 +72,15 @@ def solve_site_poses(tones: TonePhases, scenario: Scenario, cold: PoseTable, *, 
         Poses from tones, where to begin without a commanded posture; see `PoseStatus.NO_POSTURE`.
     sample_rate
         Of the recording.
+    simulated
+        Whether it was simulated: then mirrors follow the simulated sun, not that of the time.
     """
     check_site_solvable(scenario)
     unix_s = np.array([float(Fraction(int(s)) / sample_rate) for s in tones.frame_start_index])
-    commanded = commanded_normals(scenario, unix_s)
-    antenna = antenna_of(scenario)
+    commanded = commanded_normals(scenario, unix_s, simulated=simulated)
     tables = _Tables(tones, scenario, cold)
     for group in mirror_groups(scenario):
+        antenna = antenna_of(scenario, scenario.heliostat[group.column[0]])
         tables.put(group, _solve_group(tones, scenario, group, commanded, cold, antenna))
     return tables.outcome()
 
@@ -219,13 +217,6 @@ class _Tables:
 
     def outcome(self) -> SiteOutcome:
         """Return the tables."""
-        self._note_disturbed()
         return SiteOutcome(
             poses=PoseTable(**self._poses), integrity=IntegrityTable(**self._integrity), site=SiteTable(**self._site)
         )
-
-    def _note_disturbed(self) -> None:
-        weight = self._site["weight"]
-        light, counted = np.count_nonzero(weight < _LIGHT), np.count_nonzero(np.isfinite(weight))
-        if counted:
-            _log.info("%d of %d links hear more than is foreseen and count less", light, counted)
