@@ -164,9 +164,9 @@ def antenna_of(scenario: Scenario, heliostat: Heliostat | None = None) -> Receiv
         pattern = read_pattern(table.pattern).pattern
         try:
             pattern.check_receivers(places)
+            return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
         except InvalidInputError as error:
             raise ScenarioError(f"{table.pattern}, heliostat `{mirror.id}`: {error}") from error
-        return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
     if table.receiver == "dipole":
         mean_hz = float(scenario.carrier_rf_hz.mean())
         pattern = dipole_pattern(places, table.axis_mirror, mean_hz)
