@@ -20,6 +20,7 @@ _LENGTH_KEYS = frozenset(
         "position_enu_m",
         "receiver_mirror_m",
         "receiver_mirror_sigma_m",
+        "receiver_survey_sigma_m",
         "reference_range_m",
         "size_m",
         "survey_sigma_m",

@@ -71,6 +71,8 @@ class Transmitter(Record):
     position_enu_m: Point
     carrier_hz: float
     amplitude: Positive = 1.0
+    survey_sigma_m: NonNegative = 0.0
+    """How well its place is surveyed, each axis; `rfpose survey` may move it so far."""
 
 
 class CalibrationReceiver(Record):
@@ -100,6 +102,8 @@ class Mirror(Record):
     """How fast unknown delays between receivers on one oscillator drift; given, they are learned over frames."""
     pivot_sigma_m: Positive | None = None
     """How well pivots are surveyed; without it they are not used."""
+    receiver_survey_sigma_m: Positive = 0.001
+    """How well receivers' places on the mirror are known, each axis; `rfpose survey` may move them so far."""
     carrier_phase: bool = True
     """Whether receivers on one oscillator also compare the carriers' own phases."""
     mount: Literal["free", "azimuth_elevation"] = "free"
@@ -120,6 +124,7 @@ class Heliostat(Record):
     receiver_delay_sigma_s: NonNegative | None = None
     receiver_delay_drift_s_per_sqrt_min: NonNegative | None = None
     pivot_sigma_m: Positive | None = None
+    receiver_survey_sigma_m: Positive = 0.001
     carrier_phase: bool = True
     mount: Literal["free", "azimuth_elevation"] = "free"
     normal_enu: Point | None = None

@@ -10,14 +10,30 @@ from rfpose.multilat.site.fit import (
     fit_site,
     spread_starts,
 )
+from rfpose.multilat.site.survey import (
+    CASES,
+    Constants,
+    ReferencePoses,
+    Survey,
+    SurveyPrior,
+    lever_to_turn,
+    survey_site,
+)
 
 __all__ = [
+    "CASES",
     "Common",
+    "Constants",
+    "ReferencePoses",
     "SiteKnowledge",
     "SiteObservations",
     "SitePoses",
     "SiteSettings",
+    "Survey",
+    "SurveyPrior",
     "Voltages",
     "fit_site",
+    "lever_to_turn",
     "spread_starts",
+    "survey_site",
 ]

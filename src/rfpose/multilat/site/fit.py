@@ -43,6 +43,7 @@ __all__ = [
     "SiteSettings",
     "Voltages",
     "fit_site",
+    "heard_by",
     "spread_starts",
 ]
 
@@ -349,6 +350,11 @@ def fit_site(
     for _ in range(_LAST_ROUNDS):
         state = fit.run(fit.prepare(_field_of(field_at, state, everyone, common)), state, everyone, common)
     return fit.outcome(state, known, common)
+
+
+def heard_by(voltages: Voltages, shape: tuple[int, ...], settings: SiteSettings, common: Common) -> _kernels.Heard:
+    """Return voltages of (mirror, receiver, transmitter) as the kernels take them."""
+    return _Prepared.of(voltages, shape).heard(settings, common)
 
 
 def _field_of(field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> Voltages:
