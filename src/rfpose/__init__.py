@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rfpose.pipeline.layout import budget, layout_map, optimise
     from rfpose.pipeline.process import process
     from rfpose.pipeline.simulate import simulate
+    from rfpose.pipeline.survey import survey
     from rfpose.pipeline.track import track
     from rfpose.recording import open_recording
     from rfpose.scenario import load_scenario
@@ -44,6 +45,7 @@ __all__ = [
     "process",
     "shipped_scenario",
     "simulate",
+    "survey",
     "track",
 ]
 
@@ -60,6 +62,7 @@ _HOME = {
     "process": "pipeline.process",
     "shipped_scenario": "pipeline.demo",
     "simulate": "pipeline.simulate",
+    "survey": "pipeline.survey",
     "track": "pipeline.track",
 }
 

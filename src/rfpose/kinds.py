@@ -15,6 +15,7 @@ FORMAT_KINDS = {
     "rfpose-tracking": "track",
     "rfpose-mount": "model",
     "rfpose-antenna": "antenna",
+    "rfpose-survey": "survey",
 }
 """Kinds by the format that files give themselves."""
 
@@ -24,6 +25,7 @@ _WORDS = {
     "track": "a run of `rfpose track`, which `rfpose info` and `rfpose view` take",
     "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate` and `rfpose info` take",
     "antenna": "an antenna pattern, which `rfpose info` takes",
+    "survey": "a survey, which `rfpose process --survey` takes",
     "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
     "truth": "a truth, which `rfpose evaluate` takes beside a result",
 }
@@ -31,13 +33,14 @@ _MADE = {
     "result": ("result", "`rfpose process`"),
     "track": ("tracking run", "`rfpose track`"),
     "antenna": ("antenna pattern", "`scripts/antenna_pattern.py`"),
+    "survey": ("survey", "`rfpose survey`"),
 }
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
 
 def kind_of(path: str | Path) -> str | None:
-    """Return ``recording``, ``result``, ``track``, ``model``, ``antenna``, ``scenario`` or ``truth``; None: unknown.
+    """Return the kind: one of those of `FORMAT_KINDS`, ``scenario`` or ``truth``; None: unknown.
 
     By what a file says of itself at its beginning; whether it is sound is for its reader to say.
     """
@@ -81,7 +84,7 @@ def _kind_of_hdf5(path: Path) -> str | None:
 
 
 def check_kind(path: str | Path, *, wanted: str) -> None:
-    """Refuse what is no ``result``, ``track`` or ``antenna`` by its beginning, before anything is loaded to read it.
+    """Refuse what is no ``result``, ``track``, ``antenna`` or ``survey`` by its beginning, before its reader is loaded.
 
     Raises
     ------

@@ -24,6 +24,7 @@ COMMANDS = (
     "info",
     "process",
     "evaluate",
+    "survey",
     "layout",
     "calibrate",
     "aim",

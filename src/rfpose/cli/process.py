@@ -77,6 +77,11 @@ REFLECTION_NAMES = ("estimate", "ignore")
     help="Also filter poses over frames: mirrors turn steadily, outages are bridged. "
     "[default: as the scenario's [motion] says: off]",
 )
+@click.option(
+    "--survey",
+    type=click.Path(path_type=Path),
+    help="Take receivers' places, pivots and transmitters from a file of `rfpose survey`.",
+)
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @follow_links_option
 @force_option
@@ -92,6 +97,7 @@ def command(
     reflection: str | None,
     integrity: bool | None,
     filtered: bool | None,
+    survey: Path | None,
     csv_path: Path | None,
     follow_links: bool,
     force: bool,
@@ -103,7 +109,7 @@ def command(
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    claimed = outputs(output, csv_path, inputs=[recording, scenario], force=force)
+    claimed = outputs(output, csv_path, inputs=[recording, scenario, survey], force=force)
     with claimed, progress("Measuring") as on_progress:
         result = rfpose.process(
             recording,
@@ -114,6 +120,7 @@ def command(
             reflection=reflection,
             integrity=integrity,
             filtered=filtered,
+            survey=survey,
             follow_links=follow_links,
             force=force,
             on_progress=on_progress,

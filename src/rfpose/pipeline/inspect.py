@@ -40,7 +40,7 @@ def inspect_file(path: str | Path, *, follow_links: bool = False) -> dict[str, A
     """
     path = Path(path)
     kind = kind_of(path)
-    readers = {"antenna": _antenna, "model": _models, "result": _result, "track": _track}
+    readers = {"antenna": _antenna, "model": _models, "result": _result, "survey": _survey, "track": _track}
     if kind in readers:
         return {"kind": kind, "path": str(path), **readers[kind](path)}
     if kind == "truth":
@@ -133,6 +133,12 @@ def _track(path: Path) -> dict[str, Any]:
         "problems": problems,
         "sound": not problems,
     }
+
+
+def _survey(path: Path) -> dict[str, Any]:
+    from rfpose.pipeline.formats.survey_file import read_survey
+
+    return {"sound": True, "problems": [], **read_survey(path).as_dict()}
 
 
 def _antenna(path: Path) -> dict[str, Any]:

@@ -38,6 +38,7 @@ def process(
     reflection: str | None = None,
     integrity: bool | None = None,
     filtered: bool | None = None,
+    survey: str | Path | None = None,
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
@@ -66,6 +67,8 @@ def process(
         Whether residuals are tested and bad transmitters left out; None: as the scenario's ``[integrity]`` says.
     filtered
         Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
+    survey
+        File of `rfpose survey`: where receivers, pivots and transmitters are.
     follow_links
         As for `rfpose.recording.open_recording`.
     force
@@ -102,10 +105,16 @@ def process(
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
     scenario_file = None if isinstance(scenario, Scenario) else scenario
-    with claim(output, inputs=[*read, scenario_file, kept], force=force) as job:
+    with claim(output, inputs=[*read, scenario_file, survey, kept], force=force) as job:
         given = None if scenario is None else scenario_of(scenario)
         with _opened(recording, follow_links=follow_links) as opened:
             site = _choose_scenario(opened, given)
+            surveyed = None
+            if survey is not None:
+                from rfpose.pipeline.formats.survey_file import read_survey
+
+                surveyed = read_survey(survey)
+                site = surveyed.applied(site)
             check_against(opened, site)
             starts = _frames(opened, site)
             # compiled code, which none of the refusals above should wait for
@@ -126,10 +135,12 @@ def process(
             if kept is not None:
                 journal = Journal(kept, journal_key(opened, site, estimator), restart=force, resume=resume)
             tones = measure_tones(opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress)
-            asked = {"reflection": reflection, "integrity": integrity, "filter": filtered}
+            asked = {"reflection": reflection, "integrity": integrity, "filter": filtered, "survey": survey}
             settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
             truth = None if opened.truth is None else align_truth(opened.truth, site)
         result = solve(tones, site, settings=settings, truth=truth)
+        if surveyed is not None:
+            result = surveyed.widened(result)
         if output is not None:
             write_result(result, output)
         if journal is not None:
@@ -194,6 +205,8 @@ def _settings(
     command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {choice.pose}"
     if isinstance(given, str | Path):
         command += f" --scenario {Path(given).name}"
+    if asked["survey"] is not None:
+        command += f" --survey {Path(str(asked['survey'])).name}"
     if asked["reflection"] is not None:
         command += f" --reflection {asked['reflection']}"
     if asked["integrity"] is not None:

@@ -2,6 +2,7 @@
 
 from rfpose.multilat.site.fit import (
     Common,
+    FieldAt,
     SiteKnowledge,
     SiteObservations,
     SitePoses,
@@ -24,6 +25,7 @@ __all__ = [
     "CASES",
     "Common",
     "Constants",
+    "FieldAt",
     "ReferencePoses",
     "SiteKnowledge",
     "SiteObservations",

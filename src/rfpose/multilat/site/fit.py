@@ -37,6 +37,7 @@ from rfpose.propagation import RayKind, Rays
 
 __all__ = [
     "Common",
+    "FieldAt",
     "SiteKnowledge",
     "SiteObservations",
     "SitePoses",

@@ -24,7 +24,7 @@ from rfpose.pipeline.site.field import ReceivingAntenna, SiteField, antenna_of
 from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
 
-__all__ = ["SiteOutcome", "check_site_solvable", "solve_site_poses"]
+__all__ = ["SiteOutcome", "check_site_solvable", "rotations", "settings_of", "solve_site_poses"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,13 +113,13 @@ def _solve_group(
             receiver_mirror_m=np.tile(group.places_m, (n_frame, 1, 1)),
             pivot_enu_m=pivot,
             pivot_sigma_m=known.pivot_sigma_m,
-            commanded_rot=_rotations(start.reshape(n_frame * n_helio, 3)),
+            commanded_rot=rotations(start.reshape(n_frame * n_helio, 3)),
             posture_sigma_rad=sigma_rad,
             roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
             clock_sigma_m=known.clock_sigma_m,
             unit_field=antenna.strength / reach,
         ),
-        SiteField(scenario, group, _rotations(standing), antenna),
+        SiteField(scenario, group, rotations(standing), antenna),
         settings_of(scenario),
     )
 
@@ -143,8 +143,8 @@ def settings_of(scenario: Scenario) -> SiteSettings:
     )
 
 
-def _rotations(normal: FloatArray) -> FloatArray:
-    """Orientations of mirrors with a horizontal x axis; NaN where the normal is not known."""
+def rotations(normal: FloatArray) -> FloatArray:
+    """Return orientations of mirrors with a horizontal x axis; NaN where the normal is not known."""
     known = np.asarray(np.isfinite(normal).all(axis=-1))
     out = geometry.rot_enu_from_mirror(np.where(known[..., None], normal, [0.0, 0.0, 1.0]))
     return np.where(known[..., None, None], out, np.nan)

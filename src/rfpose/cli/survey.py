@@ -1,0 +1,102 @@
+"""``rfpose survey``: from recordings of many postures to what does not change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+import rfpose
+from rfpose.cli._support import (
+    common_options,
+    emit_json,
+    examples,
+    follow_links_option,
+    force_option,
+    outputs,
+    progress,
+    say,
+    table,
+    wants_json,
+)
+
+__all__ = ["command"]
+
+
+@click.command(
+    name="survey",
+    epilog=examples(
+        "rfpose survey night.h5 day.h5 -o survey.h5",
+        "rfpose survey night.h5 --reference camera.csv -o survey.h5",
+        "rfpose process recording.h5 --pose site --survey survey.h5 -o result.h5",
+    ),
+)
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RECORDING...")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Survey to write (HDF5).")
+@click.option("--scenario", type=click.Path(path_type=Path), help="Site description; wins over the recordings' own.")
+@click.option(
+    "--reference",
+    type=click.Path(path_type=Path),
+    help="CSV of normals from elsewhere, as of a camera: id, frame or time, and normal_e, normal_n, normal_u or "
+    "azimuth_deg, elevation_deg.",
+)
+@click.option(
+    "--reference-sigma",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="How good they are, in each of two directions [mrad].",
+)
+@follow_links_option
+@force_option
+@common_options
+def command(
+    recordings: tuple[Path, ...],
+    output: Path,
+    scenario: Path | None,
+    reference: Path | None,
+    reference_sigma: float,
+    follow_links: bool,
+    force: bool,
+) -> None:
+    """Find what does not change over many postures: places of receivers, pivots, transmitters.
+
+    Says what the postures do not tell: how the receivers are turned against the plate, above all, which radio alone
+    never tells.
+    """
+    with outputs(output, inputs=[*recordings, scenario, reference], force=force), progress("Surveying") as on_progress:
+        found = rfpose.survey(
+            recordings,
+            output,
+            scenario=scenario,
+            reference=reference,
+            reference_sigma_rad=1e-3 * reference_sigma,
+            follow_links=follow_links,
+            force=force,
+            on_progress=on_progress,
+        )
+        report = found.as_dict()
+    if wants_json():
+        emit_json({"survey": output, **report})
+        return
+    rows = [
+        [name, str(one["frames"]), str(one["rank"]), *(f"{x:.3f}" for x in one["normal_sigma_mrad"].values())]
+        for name, one in report["heliostats"].items()
+    ]
+    header = ["", "frames", "rank", "before", "now", "+ reference pose", "+ receiver surveyed"]
+    table("Normal's error from places [mrad]", header, rows)
+    by_words: dict[tuple[str, ...], int] = {}
+    for one in report["heliostats"].values():
+        words = tuple(one["undetermined"])
+        by_words[words] = by_words.get(words, 0) + 1
+    for words, count in by_words.items():
+        for word in words:
+            say(f"  {count} heliostats, not determined: {word}")
+    if any("rotation of the receivers" in word for words in by_words for word in words):
+        say(
+            "  radio alone does not tell how receivers are turned against the plate; "
+            "a reference pose would (--reference)"
+        )
+    for word in report["transmitters_undetermined"]:
+        say(f"  not determined: {word}")
+    say(f"wrote {output}")

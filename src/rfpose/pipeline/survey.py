@@ -1,0 +1,279 @@
+"""A survey of a site by its own radio: recordings of many postures in, what does not change out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.files import claim
+from rfpose.multilat.site import (
+    Constants,
+    FieldAt,
+    ReferencePoses,
+    SiteKnowledge,
+    SiteObservations,
+    Survey,
+    SurveyPrior,
+    survey_site,
+)
+from rfpose.pipeline.formats.survey_file import SurveyFile, write_survey
+from rfpose.pipeline.measure import measure_tones
+from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
+from rfpose.pipeline.postures import commanded_normals, read_postures
+from rfpose.pipeline.site.field import SiteField, antenna_of
+from rfpose.pipeline.site.poses import check_site_solvable, rotations, settings_of
+from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.scenario import Scenario, scenario_of
+
+__all__ = ["survey"]
+
+
+def survey(
+    recordings: Sequence[Recording | str | Path] | Recording | str | Path,
+    output: str | Path | None = None,
+    *,
+    scenario: Scenario | str | Path | None = None,
+    reference: str | Path | None = None,
+    reference_sigma_rad: float = 1e-4,
+    follow_links: bool = False,
+    force: bool = False,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> SurveyFile:
+    """Find what does not change over the postures of recordings.
+
+    Parameters
+    ----------
+    recordings
+        Of one site.
+    output
+        File to write, format ``rfpose-survey``.
+    scenario
+        The site; wins over those in the recordings.
+    reference
+        Table of normals that something else measured, as `rfpose.pipeline.postures.read_postures` reads it; frames are
+        counted through all recordings.
+    reference_sigma_rad
+        How good they are, in each of two directions [rad].
+    follow_links, force
+        As for `rfpose.pipeline.process.process`.
+    on_progress
+        Called with (steps done, steps in all).
+
+    Raises
+    ------
+    RecordingError
+        A file that is missing, damaged, or cannot be written.
+    ScenarioError
+        No scenario, or one that pose ``site`` cannot solve, or whose mirrors know no posture.
+    InvalidInputError
+        No recording; a sigma that is not above zero.
+    """
+    many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not many:
+        raise InvalidInputError("`recordings` must name one recording or more")
+    if not reference_sigma_rad > 0.0:
+        raise InvalidInputError(f"`reference_sigma_rad` must be greater than zero, got {reference_sigma_rad}")
+    read = [r for r in many if not isinstance(r, Recording)]
+    scenario_file = None if isinstance(scenario, Scenario) else scenario
+    with claim(output, inputs=[*read, scenario_file, reference], force=force):
+        site = None if scenario is None else scenario_of(scenario)
+        parts = []
+        for recording in many:
+            part = _measured(recording, site, follow_links=follow_links)
+            site = part.scenario
+            parts.append(part)
+        assert site is not None
+        found = _surveyed(parts, site, reference, reference_sigma_rad, on_progress)
+        if output is not None:
+            write_survey(output, found, force=True)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What one recording tells."""
+
+    scenario: Scenario
+    carrier: npt.NDArray[np.complex128]
+    sigma: FloatArray
+    unix_s: FloatArray
+
+
+def _measured(recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool) -> _Part:
+    opened: contextlib.AbstractContextManager[Recording] = (
+        contextlib.nullcontext(recording)
+        if isinstance(recording, Recording)
+        else open_recording(recording, follow_links=follow_links)
+    )
+    with opened as one:
+        chosen = one.scenario if site is None else site
+        if chosen is None:
+            raise ScenarioError(f"{one.path}: holds no scenario; describe the site in TOML and give `scenario=FILE`")
+        check_against(one, chosen)
+        check_site_solvable(chosen)
+        starts = frame_starts(one, chosen.radio.frame_samples)
+        if not len(starts):
+            raise ScenarioError(f"{one.path}: no stretch as long as a frame; shorten radio.frame_samples")
+        tones = measure_tones(one, chosen, starts, estimator="hilbert")
+        unix_s = np.array([float(Fraction(int(s)) / one.sample_rate) for s in starts])
+        return _Part(chosen, tones.carrier, tones.carrier_sigma, unix_s)
+
+
+def _surveyed(
+    parts: list[_Part],
+    site: Scenario,
+    reference: str | Path | None,
+    reference_sigma_rad: float,
+    on_progress: Callable[[int, int], None] | None,
+) -> SurveyFile:
+    commanded = np.concatenate([commanded_normals(site, part.unix_s) for part in parts])
+    if np.isnan(commanded[:, : len(site.heliostat)]).all():
+        raise ScenarioError(
+            f"scenario `{site.name}` says of no mirror where it was told to point; give [posture] csv, or `normal_enu`"
+        )
+    normals = None
+    if reference is not None:
+        normals = read_postures(reference, list(site.heliostat_ids), np.concatenate([p.unix_s for p in parts]))
+    groups = list(mirror_groups(site))
+    if len(groups) > 1 and any(t.survey_sigma_m > 0.0 for t in site.transmitter):
+        raise ScenarioError(
+            f"scenario `{site.name}` has mirrors of {len(groups)} kinds, and transmitters are surveyed by mirrors of "
+            "one kind alone; leave `survey_sigma_m` of [[transmitter]] out"
+        )
+    out = _Tables(site)
+    for g, group in enumerate(groups):
+
+        def told(done: int, total: int, g: int = g) -> None:
+            if on_progress is not None:
+                on_progress(g * total + done, len(groups) * total)
+
+        out.put(group, _survey_group(parts, site, group, commanded, (normals, reference_sigma_rad), told))
+    if on_progress is not None:
+        on_progress(1, 1)
+    return out.outcome()
+
+
+def _survey_group(
+    parts: list[_Part],
+    site: Scenario,
+    group: MirrorGroup,
+    commanded: FloatArray,
+    reference: tuple[FloatArray | None, float],
+    on_round: Callable[[int, int], None],
+) -> Survey:
+    n_frame = len(commanded)
+    own = commanded[:, group.column]
+    antenna = antenna_of(site)
+    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
+    known = group.estimator
+    first = site.heliostat[int(group.column[0])]
+    given = Constants(
+        receiver_mirror_m=group.places_m,
+        pivot_enu_m=group.pivot_enu_m,
+        transmitter_enu_m=np.array(site.transmitter_enu_m),
+        delay_m=np.zeros(group.rows.shape),
+    )
+    standing = rotations(commanded)
+
+    def field_for(now: Constants) -> FieldAt:
+        moved = site.changed(
+            transmitter=[
+                {**t.model_dump(exclude_none=True), "position_enu_m": place}
+                for t, place in zip(site.transmitter, now.transmitter_enu_m.tolist(), strict=True)
+            ]
+        )
+        there = replace(group, places_m=now.receiver_mirror_m, pivot_enu_m=now.pivot_enu_m)
+        return SiteField(moved, there, standing, antenna)
+
+    normals, sigma = reference
+    poses = None
+    if normals is not None:
+        picked = normals[:, group.column].reshape(-1, 3)
+        poses = ReferencePoses(normal_enu=picked, sigma_rad=np.full(len(picked), sigma))
+    return survey_site(
+        SiteObservations(
+            carrier=np.concatenate([group.of_mirrors(p.carrier) for p in parts]),
+            sigma=np.concatenate([group.of_mirrors(p.sigma) for p in parts]),
+            wavenumber_radpm=2.0 * np.pi * site.carrier_rf_hz / site.radio.propagation_speed_mps,
+        ),
+        SiteKnowledge(
+            receiver_mirror_m=np.tile(group.places_m, (n_frame, 1, 1)),
+            pivot_enu_m=pivot,
+            pivot_sigma_m=known.pivot_sigma_m,
+            commanded_rot=rotations(own.reshape(-1, 3)),
+            posture_sigma_rad=np.full(len(pivot), site.posture.sigma_rad),
+            roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
+            clock_sigma_m=known.clock_sigma_m,
+            unit_field=antenna.strength / np.linalg.norm(site.transmitter_enu_m - pivot[:, None], axis=2),
+        ),
+        given,
+        field_for,
+        prior=SurveyPrior(
+            place_sigma_m=first.receiver_survey_sigma_m,
+            pivot_sigma_m=known.pivot_sigma_m,
+            transmitter_sigma_m=np.array([t.survey_sigma_m for t in site.transmitter]),
+            delay_sigma_m=known.clock_sigma_m,
+        ),
+        settings=settings_of(site),
+        reference=poses,
+        on_round=on_round,
+    )
+
+
+class _Tables:
+    """The survey's tables, filled group by group."""
+
+    def __init__(self, site: Scenario) -> None:
+        n = len(site.heliostat)
+        most = max(len(h.receiver_mirror_m) for h in site.heliostat)
+        self._site = site
+        self._words: list[tuple[str, ...]] = [()] * n
+        self._transmitters: tuple[str, ...] = ()
+        self._place, self._place_cov = np.full((n, most, 3), np.nan), np.full((n, 3 * most, 3 * most), np.nan)
+        self._pivot, self._pivot_sigma = np.empty((n, 3)), np.empty((n, 3))
+        self._delay = np.full((n, most), np.nan)
+        self._frames, self._rank = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._normal = np.empty((n, 4))
+        self._transmitter: FloatArray = np.array(site.transmitter_enu_m)
+        self._transmitter_sigma: FloatArray = np.zeros(self._transmitter.shape)
+        self._soil = (np.zeros(2), np.zeros(2))
+
+    def put(self, group: MirrorGroup, found: Survey) -> None:
+        """Write one group."""
+        n = group.rows.shape[1]
+        arm = np.array([[0.0, 0.0, self._site.heliostat[i].arm_m] for i in group.column])
+        c, at = group.column, found.constants
+        self._place[c, :n] = at.receiver_mirror_m - arm[:, None]
+        self._place_cov[c, : 3 * n, : 3 * n] = found.cov[:, : 3 * n, : 3 * n]
+        self._pivot[c] = at.pivot_enu_m
+        self._pivot_sigma[c] = np.sqrt(np.einsum("mpp->mp", found.cov)[:, 3 * n : 3 * n + 3])
+        self._delay[c, :n] = at.delay_m
+        self._frames[c], self._rank[c] = found.n_frame, found.rank
+        self._normal[c] = found.normal_sigma_rad
+        for i, words in zip(c.tolist(), found.undetermined, strict=True):
+            self._words[i] = words
+        self._transmitter = at.transmitter_enu_m
+        self._transmitter_sigma = np.sqrt(np.diag(found.transmitter_cov)).reshape(-1, 3)
+        self._transmitters = found.transmitters_undetermined
+        common = found.poses.common
+        change = complex(common.soil_change)
+        self._soil = (np.array([change.real, change.imag]), np.array(common.soil_sigma))
+
+    def outcome(self) -> SurveyFile:
+        """Return the survey."""
+        return SurveyFile(
+            scenario=self._site, receiver_mirror_m=self._place, receiver_cov_m2=self._place_cov,
+            pivot_enu_m=self._pivot, pivot_sigma_m=self._pivot_sigma, transmitter_enu_m=self._transmitter,
+            transmitter_sigma_m=self._transmitter_sigma, delay_m=self._delay, permittivity_change=self._soil[0],
+            permittivity_sigma=self._soil[1], frame_count=self._frames, rank=self._rank,
+            normal_sigma_rad=self._normal, undetermined=tuple(self._words),
+            transmitters_undetermined=self._transmitters,
+        )  # fmt: skip
