@@ -2,8 +2,8 @@
 
     python benchmarks/site_survey.py
 
-Five heliostats of table2_100m.toml at 433 MHz, pivots known to 3 mm, 12 postures of a day, receivers off by 1 mm in each
-axis; a camera measures every second posture to 0.1 mrad.
+Five heliostats of table2_100m.toml at 433 MHz, pivots known to 3 mm, 12 postures of a day, receivers off by 1 mm in
+each axis; a camera measures every second posture to 0.1 mrad.
 """
 
 import tempfile
@@ -21,7 +21,7 @@ CAMERA_RAD = 1e-4
 
 
 def sites():
-    """The site as it is known, and as it is built."""
+    """Return the site as it is known, and as it is built."""
     rng = np.random.default_rng(SEED)
     base = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     told = {"pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
@@ -41,11 +41,13 @@ def sites():
 
 
 def show(name, result):
+    """Print error and stated sigma of a result's normals."""
     error = rf.evaluate(result).normal_error_mrad.rms
     print(f"{name:40s} {error:8.4f} {1e3 * np.sqrt(np.nanmean(result.poses.sigma_rad**2)):8.4f}")
 
 
 def main():
+    """Print the table."""
     known, built, rng = sites()
     recording = rf.simulate(built, seed=2)
     truth = recording.truth

@@ -75,6 +75,22 @@ def survey(
         No scenario, or one that pose ``site`` cannot solve, or whose mirrors know no posture.
     InvalidInputError
         No recording; a sigma that is not above zero.
+
+    Examples
+    --------
+    >>> import rfpose as rf
+    >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    >>> mirror = {"pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
+    >>> site = site.changed(
+    ...     heliostat=[{**h.model_dump(exclude_none=True), **mirror} for h in site.heliostat[:2]],
+    ...     radio={"frame_samples": 20_000, "centre_frequency_hz": 433e6},
+    ...     multipath={"foresee": [], "visibility": False},
+    ... )
+    >>> found = rf.survey(rf.simulate(site, seed=1))
+    >>> found
+    <SurveyFile 'Table 2, 100 m field': 2 of 2 heliostats in 5 frames or fewer>
+    >>> found.undetermined[0][0]
+    'rotation of the receivers against the plate about x'
     """
     many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
     if not many:
@@ -182,6 +198,12 @@ def _survey_group(
         delay_m=np.zeros(group.rows.shape),
     )
     standing = rotations(commanded)
+    for i in group.column:
+        if site.heliostat[int(i)].receiver_survey_sigma_m != first.receiver_survey_sigma_m:
+            raise ScenarioError(
+                f"`receiver_survey_sigma_m` of heliostats `{first.id}` and `{site.heliostat[int(i)].id}` differ, and "
+                "mirrors that are alike are surveyed together; give one for all"
+            )
 
     def field_for(now: Constants) -> FieldAt:
         moved = site.changed(

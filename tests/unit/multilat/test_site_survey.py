@@ -1,5 +1,7 @@
 """What does not change, surveyed from carriers in many postures: closed form, from direct rays."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.stats import chi2
 
@@ -164,3 +166,25 @@ def test_reference_poses_turn_the_receivers_to_the_plate():
     assert np.all(found.normal_sigma_rad[:, 1] < 1e-4)
     for words in found.undetermined:
         assert not any("about x" in w or "about y" in w for w in words)
+
+
+def test_transmitters_and_delays_are_found_within_their_covariance():
+    prior = replace(PRIOR, transmitter_sigma_m=np.full(len(TRANSMITTERS), 5e-3), delay_sigma_m=2e-3)
+    site = Site(6, prior=prior)
+    found = site.survey(reference=site.reference(every=3))
+    off = (found.constants.transmitter_enu_m - site.true.transmitter_enu_m).ravel()
+    chi_square_is_expected(site.own_errors(found), found.cov)
+    chi_square_is_expected(off[None], found.transmitter_cov[None])
+    assert np.all(np.diagonal(found.transmitter_cov) < 5e-3**2 * (1.0 + 1e-9))
+    assert np.trace(found.transmitter_cov) < 0.8 * 30 * 5e-3**2
+    assert all("delay common to the receivers" in words for words in found.undetermined)
+
+
+def test_a_mirror_without_frames_keeps_what_was_known():
+    site = Site(7, n_frame=4)
+    site.seen.carrier[1 :: len(PIVOTS)] = np.nan
+    found = site.survey()
+    assert found.n_frame.tolist() == [4, 0, 4, 4]
+    assert found.rank[1] == 0
+    np.testing.assert_array_equal(found.constants.receiver_mirror_m[1], PLACES)
+    np.testing.assert_allclose(np.diagonal(found.cov[1]), found.prior_sigma_m**2)

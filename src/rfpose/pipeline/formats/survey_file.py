@@ -47,7 +47,7 @@ _KEYS = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SurveyFile:
     """A survey: what does not change, and how well it is known.
 
@@ -89,6 +89,13 @@ class SurveyFile:
     normal_sigma_rad: FloatArray
     undetermined: tuple[tuple[str, ...], ...]
     transmitters_undetermined: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        seen = int(np.count_nonzero(self.frame_count))
+        return (
+            f"<SurveyFile {self.scenario.name!r}: {seen} of {len(self.frame_count)} heliostats in "
+            f"{int(self.frame_count.max(initial=0))} frames or fewer>"
+        )
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write it; see `write_survey`."""
