@@ -19,6 +19,7 @@ from rfpose.multilat.site import (
     SiteSettings,
     Voltages,
     fit_site,
+    forecast_site,
     spread_starts,
 )
 from rfpose.propagation import RayKind, Rays
@@ -219,3 +220,52 @@ def test_arrays_of_other_mirrors_are_refused() -> None:
         world.fit(world.observed(), other.known())
     with pytest.raises(InvalidInputError, match="one shape"):
         SiteObservations(carrier=np.ones((2, 3, 4), complex), sigma=np.ones((2, 3)), wavenumber_radpm=np.ones(4))
+
+
+@pytest.mark.parametrize("told", [0j, -0.5 + 0.2j])
+def test_the_forecast_is_the_covariance_of_weighed_phases(told: complex) -> None:
+    world = World(3, seed=5, coefficient=told)
+    known, floor, tail, noise = world.known(), 0.02, 8.0, 1e-4
+    exact = SiteSettings(floor=floor, tail=tail, factor_sigma={}, soil_sigma=(0.0, 0.0))
+    sigma = np.full(world.field.shape, noise)
+    found = forecast_site(sigma, np.full(len(TRANSMITTER), WAVENUMBER), known, world.foreseen, exact)
+    assert (found.status == PoseStatus.OK).all()
+
+    def field(m: int, w: np.ndarray) -> np.ndarray:
+        rot = Rotation.from_rotvec(w[:3]).as_matrix() @ known.commanded_rot[m]
+        at = known.pivot_enu_m[m] + w[3:] + PLACES @ rot.T
+        total = 0j
+        for gain, source in ((1.0, TRANSMITTER), (told, TRANSMITTER * [1.0, 1.0, -1.0])):
+            # a ray's voltage is that of where the mirror stands
+            there = known.pivot_enu_m[m] + PLACES @ known.commanded_rot[m].T
+            way, stands = (np.linalg.norm(source - a[:, None], axis=-1) for a in (at, there))
+            total = total + gain / stands * np.exp(-1j * WAVENUMBER * way)
+        return np.asarray(total).ravel()
+
+    for m in range(3):
+        h = field(m, np.zeros(6))
+        slope = np.stack([np.angle(field(m, 1e-6 * e) / field(m, -1e-6 * e)) / 2e-6 for e in np.eye(6)], axis=1)
+        rows = np.hstack([slope, np.tile(np.eye(len(TRANSMITTER)), (len(PLACES), 1))])
+        stray = floor * np.tile(known.unit_field[m], len(PLACES))
+        rows *= (np.abs(h) / np.hypot(noise, stray))[:, None]
+        info = rows.T @ rows
+        normal = known.commanded_rot[m][:, 2]
+        roll = min(POSTURE_RAD / np.hypot(*normal[:2]), 1.0)
+        info[:3, :3] += (np.eye(3) - np.outer(normal, normal)) / POSTURE_RAD**2 + np.outer(normal, normal) / roll**2
+        info[3:6, 3:6] += np.eye(3) / PIVOT_M**2
+        cross = np.cross(np.eye(3), normal)
+        expected = cross.T @ np.linalg.inv(info)[:3, :3] @ cross * (tail + 3.0) / (tail + 1.0)
+        np.testing.assert_allclose(found.normal_cov[m], expected, rtol=2e-3, atol=1e-3 * np.trace(expected))
+
+
+def test_a_forecast_without_anything_to_begin_from_says_so() -> None:
+    world = World(3, seed=5)
+    known = world.known()
+    known.commanded_rot[1] = np.nan
+    sigma = np.full(world.field.shape, 1e-6)
+    wavenumber = np.full(len(TRANSMITTER), WAVENUMBER)
+    found = forecast_site(sigma, wavenumber, known, world.foreseen)
+    assert found.status.tolist() == [PoseStatus.OK, PoseStatus.NO_POSTURE, PoseStatus.OK]
+    assert np.isnan(found.normal_cov[1]).all()
+    given = forecast_site(sigma, wavenumber, known, world.foreseen, SiteSettings(floor=0.05, tail=3.0))
+    np.testing.assert_array_equal(found.cov, given.cov)

@@ -19,7 +19,7 @@ __all__ = ["CRITERIA", "ESTIMATORS", "field_options", "postures"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 # names only, since the modules that define them load numpy
-ESTIMATORS = ("scenario", "independent", "rigid", "shared-clock", "carrier", "delays", "pivot", "reflection")
+ESTIMATORS = ("scenario", "independent", "rigid", "shared-clock", "carrier", "delays", "pivot", "reflection", "site")
 CRITERIA = ("pdop", "independent", "rigid", "shared-clock")
 
 

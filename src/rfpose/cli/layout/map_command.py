@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from rfpose.cli._support import (
     wants_json,
 )
 from rfpose.cli.layout._options import ESTIMATORS, field_options, postures
+from rfpose.shown import counted
 
 __all__ = ["command"]
 
@@ -34,11 +36,13 @@ __all__ = ["command"]
         "rfpose layout map site.toml --sun 120 30 --sun 180 60 --estimator rigid --picture map.png --csv map.csv",
         "rfpose layout map site.toml --day 2026-06-21 --stow --line-of-sight 3.2 2.6 --tower 4 60",
         "rfpose layout map site.toml --estimator rigid --sensitivity",
+        "rfpose layout map site.toml --estimator site --day 2026-06-21 --csv map.csv",
     ),
 )
 @click.argument("scenario", type=click.Path(path_type=Path))
 @click.option("--estimator", "estimators", type=click.Choice(ESTIMATORS), multiple=True,
-              help="Default: all that the scenario allows; `scenario`: as `rfpose process` solves it.")  # fmt: skip
+              help="Default: all that the scenario allows but `site`. `scenario`: as `rfpose process` solves it; "
+                   "`site`: as it does with --pose site.")  # fmt: skip
 @click.option("--snr", "tone_snr_db", type=float, help="Tone SNR [dB] instead of the scenario's.")
 @click.option("--line-of-sight", "sight", type=(float, float), metavar="WIDTH HEIGHT",
               help="Count only what receivers see past plates of this size [m].")  # fmt: skip
@@ -115,6 +119,8 @@ def _say(summary: dict[str, Any]) -> None:
     if sight is not None:
         say(f"a receiver sees {sight['seen_mean']:.3g} transmitters on average, {sight['seen_least']:g} at the least")
     _say_postures(summary)
+    for reason, count in Counter(summary.get("site_unsolved", {}).values()).most_common():
+        say(f"site: {counted(count, 'heliostat')} not solved in every posture: {reason}")
     for name, lost in summary["normal_without_transmitter_mrad"].items():
         worst = max(lost, key=lambda key: lost[key])
         say(f"{name}: losing {worst} is worst, {lost[worst]:.4g} mrad rms")

@@ -9,6 +9,7 @@ from rfpose.multilat.site.fit import (
     SiteSettings,
     Voltages,
     fit_site,
+    forecast_site,
     spread_starts,
 )
 from rfpose.multilat.site.survey import (
@@ -35,6 +36,7 @@ __all__ = [
     "SurveyPrior",
     "Voltages",
     "fit_site",
+    "forecast_site",
     "lever_to_turn",
     "spread_starts",
     "survey_site",

@@ -44,6 +44,7 @@ __all__ = [
     "SiteSettings",
     "Voltages",
     "fit_site",
+    "forecast_site",
     "heard_by",
     "spread_starts",
 ]
@@ -322,21 +323,8 @@ def fit_site(
     """
     chosen = settings or SiteSettings()
     fit = _Fit(observations, knowledge, chosen)
-    given = Common(
-        floor=_FIRST_FLOOR if chosen.floor is None else chosen.floor,
-        tail=_FIRST_TAIL if chosen.tail is None else chosen.tail,
-        factor_scale=np.ones(len(RayKind)),
-        soil_change=0j,
-        soil_sigma=chosen.soil_sigma,
-    )
-    known = np.asarray(
-        np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
-    )
-    everyone = np.flatnonzero(known)
-    some = everyone[
-        np.unique(np.linspace(0, max(len(everyone) - 1, 0), _LEARN_MIRRORS).astype(np.int64))[: len(everyone)]
-    ]
-    common, state, before = given, _State.begin(knowledge), 0j
+    known, everyone, some = _who(knowledge)
+    common, state, before = _given(chosen), _State.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, some, common), some, common)
     for k in range(chosen.rounds + _MORE_ROUNDS):
@@ -356,6 +344,86 @@ def fit_site(
 def heard_by(voltages: Voltages, shape: tuple[int, ...], settings: SiteSettings, common: Common) -> _kernels.Heard:
     """Return voltages of (mirror, receiver, transmitter) as the kernels take them."""
     return _Prepared.of(voltages, shape).heard(settings, common)
+
+
+def forecast_site(
+    sigma: FloatArray,
+    wavenumber_radpm: FloatArray,
+    knowledge: SiteKnowledge,
+    field_at: FieldAt,
+    settings: SiteSettings | None = None,
+) -> SitePoses:
+    """Return what `fit_site` would state of mirrors that stand as commanded, from what they are expected to receive.
+
+    Nothing is learned but the ground's permittivity, from all these mirrors: what nothing foresees is as strong as
+    ``settings.floor`` says (None: 0.05 of the direct field) and has Student's distribution of ``settings.tail`` (None:
+    3) degrees of freedom; rays' factors are as uncertain as given. Poses are taken to be found: whether a second one
+    fits alike is not asked.
+
+    Parameters
+    ----------
+    sigma : (mirror, receiver, transmitter)
+        Standard deviation of the real part of each carrier, in units of the voltages.
+    wavenumber_radpm : (transmitter,)
+        2π/λ of each carrier [rad/m].
+    knowledge, field_at, settings
+        As `fit_site` has them.
+
+    Raises
+    ------
+    InvalidInputError
+        Arrays that do not fit each other.
+    """
+    chosen = settings or SiteSettings()
+    known, everyone, some = _who(knowledge)
+    common, state = _given(chosen), _State.begin(knowledge)
+    voltages = _field_of(field_at, state, everyone, common)
+    carrier = _received(voltages, wavenumber_radpm, knowledge)
+    # one step from the truth: residuals are zero, so that links keep the weight that they have on average
+    fit = _Fit(
+        SiteObservations(carrier=carrier, sigma=sigma, wavenumber_radpm=wavenumber_radpm),
+        knowledge,
+        chosen,
+        max_steps=1,
+    )
+    prepared, told = fit.prepare(voltages), _Told.of(len(known))
+    fit.run(prepared, state, some, common, told)
+    common = fit.with_soil(told, some, common)
+    return fit.outcome(fit.run(prepared, state, everyone, common), known, common)
+
+
+def _received(voltages: Voltages, wavenumber_radpm: FloatArray, knowledge: SiteKnowledge) -> ComplexArray:
+    """(mirror, receiver, transmitter) sum of the rays of mirrors as commanded; NaN where there is none."""
+    shape = (*knowledge.receiver_mirror_m.shape[:2], len(wavenumber_radpm))
+    rays = voltages.rays
+    link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
+    mirror = link // (shape[1] * shape[2])
+    at = knowledge.pivot_enu_m[mirror] + np.einsum("kab,kb->ka", knowledge.commanded_rot[mirror], rays.place_mirror_m)
+    path_m = np.linalg.norm(rays.source_enu_m - at, axis=1) + rays.extra_m
+    out = np.zeros(int(np.prod(shape)), np.complex128)
+    np.add.at(out, link, voltages.voltage * np.exp(-1j * wavenumber_radpm[link % shape[2]] * path_m))
+    return np.where(out == 0.0, np.nan, out).reshape(shape)
+
+
+def _given(settings: SiteSettings) -> Common:
+    """Return what is taken of all mirrors before any residual is seen."""
+    return Common(
+        floor=_FIRST_FLOOR if settings.floor is None else settings.floor,
+        tail=_FIRST_TAIL if settings.tail is None else settings.tail,
+        factor_scale=np.ones(len(RayKind)),
+        soil_change=0j,
+        soil_sigma=settings.soil_sigma,
+    )
+
+
+def _who(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
+    """Return which mirrors can be begun with, the same as rows, and rows spread over them from which all learn."""
+    known = np.asarray(
+        np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
+    )
+    everyone = np.flatnonzero(known)
+    spread = np.unique(np.linspace(0, max(len(everyone) - 1, 0), _LEARN_MIRRORS).astype(np.int64))
+    return known, everyone, everyone[spread[: len(everyone)]]
 
 
 def _field_of(field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> Voltages:
@@ -459,13 +527,21 @@ def _alike(one: Common, other: Common) -> bool:
 class _Fit:
     """The kernel with everything that does not change from call to call."""
 
-    def __init__(self, observations: SiteObservations, knowledge: SiteKnowledge, settings: SiteSettings) -> None:
+    def __init__(
+        self,
+        observations: SiteObservations,
+        knowledge: SiteKnowledge,
+        settings: SiteSettings,
+        *,
+        max_steps: int = _MAX_STEPS,
+    ) -> None:
         n, n_rx, n_tx = observations.carrier.shape
         if knowledge.receiver_mirror_m.shape != (n, n_rx, 3) or knowledge.unit_field.shape != (n, n_tx):
             raise InvalidInputError(
                 "`observations` and `knowledge` are not of the same mirrors, receivers, transmitters"
             )
         self.seen, self.known, self.settings = observations, knowledge, settings
+        self._max_steps = max_steps
         self._own_scale = 0.0 if np.isinf(settings.own_scale) else settings.own_scale
         self._links = _kernels.Seen(
             np.ascontiguousarray(observations.carrier, np.complex128),
@@ -502,7 +578,7 @@ class _Fit:
             self._links,
             prepared.heard(self.settings, common),
             self._prior,
-            _kernels.Law(common.floor, common.tail, self._own_scale, _MAX_STEPS),
+            _kernels.Law(common.floor, common.tail, self._own_scale, self._max_steps),
             _kernels.Ended(
                 out.pivot, out.rot, out.cov, out.weight, out.residual, out.sigma, out.scale, out.total, out.dof,
                 out.cost, out.steps, told.factor, told.soil,
@@ -534,7 +610,6 @@ class _Fit:
         return chosen
 
     def _learn_with(self, prepared: _Prepared, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
-        given = common
         told = _Told.of(len(state.cost))
         for _ in range(_LEARN_ROUNDS):
             state = self.run(prepared, state, rows, common, told)
@@ -544,7 +619,7 @@ class _Fit:
         n_link = np.isfinite(state.weight[rows]).sum(axis=(1, 2))
         cost = state.cost[rows] + n_link * _t_constant(common.tail)
         total = float(np.nansum(cost)) if np.isfinite(cost).any() else np.inf
-        return total, replace(common, **self._soil(told, rows, given))
+        return total, self.with_soil(told, rows, common)
 
     def _learned(self, state: _State, told: _Told, rows: IntArray, common: Common) -> Common:
         total, dof = state.total[rows], state.dof[rows]
@@ -562,7 +637,7 @@ class _Fit:
         scale = np.clip(common.factor_scale * change, _LEAST_FACTOR_SCALE, 1.0 / _LEAST_FACTOR_SCALE)
         return replace(common, floor=max(floor, self.settings.least_floor), factor_scale=scale)
 
-    def _soil(self, told: _Told, rows: IntArray, given: Common) -> dict[str, Any]:
+    def with_soil(self, told: _Told, rows: IntArray, given: Common) -> Common:
         """Join what mirrors say of the ground's permittivity, each about the mean that was given."""
         estimate, share = np.moveaxis(np.nan_to_num(told.soil[rows]), 2, 0)
         share = np.clip(share, 0.0, 1.0 - 1e-9)
@@ -573,7 +648,9 @@ class _Fit:
         joint = (info * own).sum(axis=0) / (1.0 + info.sum(axis=0))
         change = sigma * np.clip(joint, -_SOIL_STEP, _SOIL_STEP)
         left = np.maximum(sigma / np.sqrt(1.0 + info.sum(axis=0)), np.minimum(_LEAST_SOIL_SIGMA, sigma))
-        return {"soil_change": given.soil_change + complex(*change), "soil_sigma": (float(left[0]), float(left[1]))}
+        return replace(
+            given, soil_change=given.soil_change + complex(*change), soil_sigma=(float(left[0]), float(left[1]))
+        )
 
     def outcome(self, state: _State, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""

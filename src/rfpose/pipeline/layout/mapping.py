@@ -18,7 +18,9 @@ from rfpose.layout.maps import ESTIMATORS, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
 from rfpose.measurement import SCENARIO, first_snr
+from rfpose.multilat import PoseStatus
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.site import SiteForecast, forecast_normals
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, counted, number
 from rfpose.tables import Tabled
@@ -31,7 +33,10 @@ __all__ = ["LayoutMap", "SightMap", "layout_map"]
 REFLECTION = "reflection"
 """The scenario's own solver, the ground's coefficient estimated with the poses; where ``[simulation.ground]`` is."""
 
-NAMES = (SCENARIO, *ESTIMATORS, REFLECTION)
+SITE = "site"
+"""What pose ``site`` would state, rays foreseen; only where asked for, since foreseeing them takes its time."""
+
+NAMES = (SCENARIO, *ESTIMATORS, REFLECTION, SITE)
 """Estimators to study; the first is that of `rfpose process`."""
 
 BoolArray = npt.NDArray[np.bool_]
@@ -81,6 +86,8 @@ class LayoutMap(Shown, Tabled):
         With line of sight; else everything is in view.
     sensitivity : estimator to its response
         Where asked for.
+    unsolved : (heliostat,)
+        Where ``site`` is studied: why a mirror is not solved in the first posture in which it is not; empty: it is.
     """
 
     scenario: Scenario
@@ -96,6 +103,7 @@ class LayoutMap(Shown, Tabled):
     lost_one_mrad: dict[str, FloatArray]
     sight: SightMap | None = None
     sensitivity: dict[str, TransmitterSensitivity] = field(default_factory=dict)
+    unsolved: tuple[str, ...] = ()
 
     @property
     def n_posture(self) -> int:
@@ -135,6 +143,10 @@ class LayoutMap(Shown, Tabled):
                 },
                 "transmitter_seen_share": dict(zip(ids, seen.seen_share, strict=True)),
             }
+        if any(self.unsolved):
+            out["site_unsolved"] = {
+                name: reason for name, reason in zip(self.heliostat_ids, self.unsolved, strict=True) if reason
+            }
         if self.sensitivity:
             out["sensitivity"] = {name: _sensitivity_dict(ids, s) for name, s in self.sensitivity.items()}
         return out
@@ -155,6 +167,7 @@ class LayoutMap(Shown, Tabled):
         header = ["id", "east_m", "north_m", "up_m", "pdop", "vdop"]
         header += [f"normal_{name}_{kind}_mrad" for name in names for kind in ("rms", "worst")]
         header += ["seen_mean", "seen_least"] if self.sight else []
+        header += ["site_unsolved"] if self.unsolved else []
         rows = []
         for i, name in enumerate(self.heliostat_ids):
             values = [*self.pivot_enu_m[i], self.pdop[i], self.vdop[i]]
@@ -162,7 +175,7 @@ class LayoutMap(Shown, Tabled):
                 values += [self.rms_mrad[key][i], self.worst_mrad[key][i]]
             if self.sight is not None:
                 values += [self.sight.seen_mean[:, i].mean(), self.sight.seen_least[:, i].min()]
-            rows.append([name, *values])
+            rows.append([name, *values, *self.unsolved[i : i + 1]])
         return header, rows
 
     def plot(self, *, estimator: str | None = None) -> Figure:
@@ -201,8 +214,9 @@ def layout_map(
         The site, or its TOML file.
     estimators
         Out of `NAMES`: ``scenario``, what `rfpose process` makes of it, without reflections; those of
-        `rfpose.layout.maps.ESTIMATORS`; and ``reflection``: the scenario's own solver with the ground's coefficient
-        estimated. None: all that the scenario allows.
+        `rfpose.layout.maps.ESTIMATORS`; ``reflection``: the scenario's own solver with the ground's coefficient
+        estimated; and ``site``: what pose ``site`` states, the rays foreseen. None: all that the scenario allows but
+        ``site``, which takes its time.
     suns_deg
         Azimuth and elevation of suns; short for ``postures``.
     postures
@@ -246,7 +260,7 @@ def _map(
 ) -> LayoutMap:
     transmitter = scenario.transmitter_enu_m
     if estimators is None:
-        estimators = [name for name in NAMES if not _lacks(scenario, name, sight)]
+        estimators = [name for name in NAMES if name != SITE and not _lacks(scenario, name, sight)]
     for name in estimators:
         lacking = _lacks(scenario, name, sight)
         if lacking:
@@ -257,9 +271,14 @@ def _map(
     )
     dilution = maps.dilution(transmitter, scenario.pivot_enu_m)
     rms, worst, by_posture, undetermined, lost, response = {}, {}, {}, {}, {}, {}
+    unsolved: tuple[str, ...] = ()
     for name in estimators:
         if name == REFLECTION:
             sigma = 1e3 * np.array([_with_reflection(scenario, p, tone_snr_db) for p in studied])
+        elif name == SITE:
+            forecasts = [_with_site(scenario, p, tone_snr_db) for p in studied]
+            sigma = 1e3 * np.array([found.sigma_rad for found in forecasts])
+            unsolved = _reasons(np.array([found.status for found in forecasts]))
         else:
             study = maps.study_of(scenario, name, tone_snr_db=tone_snr_db)
             sigma = 1e3 * np.array(
@@ -291,6 +310,7 @@ def _map(
         lost_one_mrad=lost,
         sight=None if seen is None else _sight_map(np.array(seen)),
         sensitivity=response,
+        unsolved=unsolved,
     )
 
 
@@ -299,6 +319,8 @@ def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
     carrier = name == REFLECTION or (name in ESTIMATORS and ESTIMATORS[name].carrier)
     if name == REFLECTION and scenario.simulation.ground is None:
         return "needs a ground that reflects; add [simulation.ground], or choose another"
+    if name == SITE and sight is not None:
+        return "foresees for itself what hides ([site.structures]); leave `sight=` away, or choose another"
     if name == REFLECTION and sight is not None:
         return "knows no line of sight; leave `sight=` away, or choose another"
     if carrier and not scenario.has_rf_carriers:
@@ -312,6 +334,17 @@ def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | 
     """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
     snr = {} if tone_snr_db is None else {"tone_snr_db": tone_snr_db}
     return noise_bound(make_plan(scenario.changed(budget={"ground": "estimated"}, simulation=snr), posture.mirrors))
+
+
+def _with_site(scenario: Scenario, posture: Posture, tone_snr_db: float | None) -> SiteForecast:
+    rot = np.concatenate([posture.mirrors.rot_enu_from_mirror, posture.plate_rot])
+    return forecast_normals(scenario, rot, tone_snr_db=tone_snr_db)
+
+
+def _reasons(status: npt.NDArray[np.int64]) -> tuple[str, ...]:
+    """(heliostat,) why each is not solved, of the first posture (posture, heliostat) in which it is not."""
+    first = np.take_along_axis(status, np.argmax(status != PoseStatus.OK, axis=0)[None], axis=0)[0]
+    return tuple("" if s == PoseStatus.OK else PoseStatus(s).reason for s in first.tolist())
 
 
 def _rms(sigma: FloatArray, axis: int) -> FloatArray:

@@ -14,7 +14,13 @@ from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.feedback.sun import Site as SunSite
 from rfpose.feedback.sun import sun_position
-from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
+from rfpose.geometry import (
+    azimuth_elevation_from_enu,
+    bisector_enu,
+    enu_from_azimuth_elevation,
+    rot_enu_from_mirror,
+    unit,
+)
 from rfpose.layout import maps
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.sight import Plates, Tower
@@ -59,10 +65,21 @@ class Postures:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Posture:
-    """One posture of the whole field: what it is called, and its mirrors."""
+    """One posture of the whole field.
+
+    Attributes
+    ----------
+    name
+        What it is called.
+    mirrors
+        The heliostats.
+    plate_rot : (plate, 3, 3)
+        Orientations of the plates of ``[site.structures]``, which are told what the heliostats are told.
+    """
 
     name: str
     mirrors: Mirrors
+    plate_rot: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,10 +129,27 @@ def postures_of(scenario: Scenario, wanted: Postures) -> list[Posture]:
             suns += _suns_of_day(scenario, date(wanted.year, month, 21), _YEAR_STEP_MIN)
     if (wanted.day is not None or wanted.year is not None) and not suns:
         raise ScenarioError(f"the sun stays below {_LOWEST_SUN_DEG:g}° on that day; choose another")
-    found = [Posture(name=name, mirrors=maps.mirrors_of(scenario, sun_enu=_direction(sun))) for name, sun in suns]
+    found = [_posture(scenario, name, sun_enu=_direction(sun)) for name, sun in suns]
     if wanted.stow:
-        found.append(Posture(name="stow", mirrors=maps.mirrors_of(scenario, normal_enu=[0.0, 0.0, 1.0])))
-    return found or [Posture(name=maps.posture_name(scenario), mirrors=maps.mirrors_of(scenario))]
+        found.append(_posture(scenario, "stow", normal_enu=np.array([0.0, 0.0, 1.0])))
+    return found or [_posture(scenario, maps.posture_name(scenario))]
+
+
+def _posture(
+    scenario: Scenario, name: str, *, sun_enu: FloatArray | None = None, normal_enu: FloatArray | None = None
+) -> Posture:
+    mirrors = maps.mirrors_of(scenario, normal_enu=normal_enu, sun_enu=sun_enu)
+    plates = scenario.site.structures.plate
+    own = [None if sun_enu is not None or normal_enu is not None else p.normal_enu for p in plates]
+    sun = scenario.simulated_sun_enu if sun_enu is None and normal_enu is None else sun_enu
+    normal = np.tile([0.0, 0.0, 1.0] if normal_enu is None else normal_enu, (len(plates), 1))
+    if sun is not None and plates:
+        place = np.array([p.pivot_enu_m for p in plates])
+        normal = bisector_enu(np.asarray(scenario.site.aim_enu_m) - place, sun)
+    for i, told in enumerate(own):
+        if told is not None:
+            normal[i] = unit(told)
+    return Posture(name=name, mirrors=mirrors, plate_rot=rot_enu_from_mirror(normal))
 
 
 def _direction(sun_deg: Sun) -> FloatArray:

@@ -99,28 +99,45 @@ def _solve_group(
     start = np.where(told[..., None], own, cold.normal_enu[:, group.column])
     standing = commanded_enu.copy()
     standing[:, group.column] = start
-    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
-    reach = np.linalg.norm(scenario.transmitter_enu_m - pivot[:, None], axis=2)
     sigma_rad = np.where(told, scenario.posture.sigma_rad, np.inf).ravel()
-    known = group.estimator
     return fit_site(
         SiteObservations(
             carrier=np.ascontiguousarray(group.of_mirrors(tones.carrier)),
             sigma=np.ascontiguousarray(group.of_mirrors(tones.carrier_sigma)),
-            wavenumber_radpm=2.0 * np.pi * scenario.carrier_rf_hz / scenario.radio.propagation_speed_mps,
+            wavenumber_radpm=wavenumbers_of(scenario),
         ),
-        SiteKnowledge(
-            receiver_mirror_m=np.tile(group.places_m, (n_frame, 1, 1)),
-            pivot_enu_m=pivot,
-            pivot_sigma_m=known.pivot_sigma_m,
-            commanded_rot=rotations(start.reshape(n_frame * n_helio, 3)),
-            posture_sigma_rad=sigma_rad,
-            roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
-            clock_sigma_m=known.clock_sigma_m,
-            unit_field=antenna.strength / reach,
-        ),
+        knowledge_of(scenario, group, rotations(start.reshape(n_frame * n_helio, 3)), sigma_rad, antenna),
         SiteField(scenario, group, rotations(standing), antenna),
         settings_of(scenario),
+    )
+
+
+def wavenumbers_of(scenario: Scenario) -> FloatArray:
+    """(transmitter,) 2π/λ of each carrier [rad/m]."""
+    return np.asarray(2.0 * np.pi * scenario.carrier_rf_hz / scenario.radio.propagation_speed_mps)
+
+
+def knowledge_of(
+    scenario: Scenario,
+    group: MirrorGroup,
+    commanded_rot: FloatArray,
+    posture_sigma_rad: FloatArray,
+    antenna: ReceivingAntenna,
+) -> SiteKnowledge:
+    """Return what is known of a group's mirrors that were told to stand so (frame × heliostat, 3, 3)."""
+    n_frame = len(commanded_rot) // len(group.column)
+    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
+    reach = np.linalg.norm(scenario.transmitter_enu_m - pivot[:, None], axis=2)
+    known = group.estimator
+    return SiteKnowledge(
+        receiver_mirror_m=np.tile(group.places_m, (n_frame, 1, 1)),
+        pivot_enu_m=pivot,
+        pivot_sigma_m=known.pivot_sigma_m,
+        commanded_rot=commanded_rot,
+        posture_sigma_rad=posture_sigma_rad,
+        roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
+        clock_sigma_m=known.clock_sigma_m,
+        unit_field=antenna.strength / reach,
     )
 
 

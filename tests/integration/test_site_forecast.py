@@ -1,0 +1,121 @@
+"""What a map forecasts of pose site is what pose site states of carriers that hold rays, stray fields and noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import rfpose as rf
+from rfpose import geometry
+from rfpose.dsp import TonePhases
+from rfpose.multilat import PoseStatus
+from rfpose.multilat.site import Common
+from rfpose.pipeline.layout import layout_map
+from rfpose.pipeline.mirrors import mirror_groups
+from rfpose.pipeline.site import SiteField, antenna_of
+from rfpose.pipeline.solve import solve
+from rfpose.propagation import RayKind
+from rfpose.scenario import Scenario
+
+N_MIRROR, N_SAMPLE, TAIL = 12, 40_000, 8.0
+GROUND = {"model": "fresnel", "permittivity": 12.0, "conductivity_s_per_m": 0.01}
+FACTORS = {RayKind.GROUND: (0.05, 0.05), RayKind.SPECULAR: (0.1, 0.3), RayKind.DIFFRACTED: (0.1, 0.3)}
+
+
+def site(*, ground: bool, plate: bool, snr_db: float = 45.0, floor: float = 0.03) -> Scenario:
+    """Return mirrors among Table 2's transmitters, each with a metal plate beside it if asked for."""
+    rng = np.random.default_rng(3)
+    table2 = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    normal = geometry.unit(rng.normal(size=(N_MIRROR, 3)) * 0.3 + [0.0, 0.0, 1.0])
+    pivot = np.array([[12.0 * (k % 6) - 30.0, 12.0 * (k // 6) - 18.0, 3.0] for k in range(N_MIRROR)])
+    square = [(x, y, 0.05) for x in (1.1, -1.1) for y in (0.8, -0.8)]
+    heliostats = [
+        {
+            "id": f"H{k}", "pivot_enu_m": tuple(pivot[k]), "receiver_mirror_m": square, "pivot_sigma_m": 0.005,
+            "receiver_ids": [f"H{k}.{r}" for r in range(4)], "normal_enu": tuple(normal[k]), "oscillator": "shared",
+            "carrier_phase": True, "receiver_delay_sigma_s": 1e-12,
+        }
+        for k in range(N_MIRROR)
+    ]  # fmt: skip
+    plates = [
+        {"id": f"P{k}", "pivot_enu_m": tuple(pivot[k] + [6.0, 0.0, 0.0]), "width_m": 3.0, "height_m": 2.0,
+         "normal_enu": (-1.0, 0.2, 0.3)}
+        for k in range(N_MIRROR)
+    ]  # fmt: skip
+    return table2.changed(
+        heliostat=heliostats,
+        calibration_receiver=[],
+        radio={"centre_frequency_hz": 433e6, "frame_samples": N_SAMPLE},
+        simulation={"tone_snr_db": snr_db, "path_loss": "free_space", "reference_range_m": 100.0},
+        multipath={"floor": floor, "tail": TAIL, "reach_m": 8.0, "rounds": 1},
+        **({"reflection": GROUND} if ground else {}),
+        **({"site": {"structures": {"plate": plates}}} if plate else {}),
+    )
+
+
+def measured(scenario: Scenario, seed: int) -> TonePhases:
+    """Return carriers of one frame: foreseen rays with factors as wrong as is said, stray fields, the radio's noise."""
+    rng = np.random.default_rng(seed)
+    floor, snr_db = scenario.multipath.floor, scenario.simulation.tone_snr_db
+    assert floor is not None
+    (group,) = mirror_groups(scenario)
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
+    common = Common(floor=floor, tail=TAIL, factor_scale=np.ones(5), soil_change=0j, soil_sigma=(0.3, 0.1))
+    mine = rot[:N_MIRROR]
+    heard = SiteField(scenario, group, rot[None], antenna_of(scenario))(group.pivot_enu_m, mine, common)
+    shape = (*group.rows.shape, len(scenario.transmitter))
+    link = np.repeat(np.arange(len(heard.rays.first) - 1), np.diff(heard.rays.first))
+    mirror, _, transmitter = np.unravel_index(link, shape)
+    k = 2.0 * np.pi * scenario.carrier_rf_hz / scenario.radio.propagation_speed_mps
+    at = group.pivot_enu_m[mirror] + np.einsum("kab,kb->ka", mine[mirror], heard.rays.place_mirror_m)
+    path = np.linalg.norm(heard.rays.source_enu_m - at, axis=1) + heard.rays.extra_m
+    ground = heard.rays.kind == RayKind.GROUND
+    shared = np.stack(
+        [mirror, heard.rays.kind, np.where(ground, 0, heard.rays.thing), np.where(ground, 0, transmitter)]
+    )
+    _, alike = np.unique(shared, axis=1, return_inverse=True)
+    draw = rng.normal(size=(2, alike.max() + 1))[:, alike.ravel()]
+    sigma = np.array([FACTORS.get(kind, (0.0, 0.0)) for kind in RayKind])[heard.rays.kind].T
+    voltage = heard.voltage * (1.0 + sigma[0] * draw[0] + 1j * sigma[1] * draw[1])
+    carrier = np.zeros(int(np.prod(shape)), complex)
+    np.add.at(carrier, link, voltage * np.exp(-1j * k[transmitter] * path))
+    direct = 1.0 / np.linalg.norm(scenario.transmitter_enu_m - group.pivot_enu_m[:, None], axis=-1)[:, None]
+    normal = rng.normal(size=(2, *shape)) / np.sqrt(rng.chisquare(TAIL, shape) / TAIL)
+    stray = floor * direct * (normal[0] + 1j * normal[1])
+    index = scenario.tone[0].modulation_index
+    # the tone's amplitude is a·m, and a = 1 at 100 m
+    noise = index / np.sqrt(2.0 * N_SAMPLE * 10.0 ** (snr_db / 10.0)) / 100.0
+    normal = rng.normal(size=(2, *shape))
+    seen = carrier.reshape(shape) + stray + noise * (normal[0] + 1j * normal[1])
+    tones = TonePhases.empty(
+        receiver_ids=scenario.receiver_ids, transmitter_ids=scenario.transmitter_ids, tone_hz=scenario.tone_hz,
+        frame_start_index=np.zeros(1, np.int64),
+    )  # fmt: skip
+    tones.carrier[0, group.rows], tones.carrier_sigma[0, group.rows] = seen, noise
+    tones.phase_rad[0, group.rows], tones.sigma_rad[0, group.rows] = 0.0, 0.1
+    tones.status[:] = 0
+    return tones
+
+
+CASES = [
+    (False, False, 45.0, 0.03),
+    (True, False, 45.0, 0.03),
+    (False, True, 45.0, 0.03),
+    (True, True, 45.0, 0.03),
+    (True, True, -26.0, 1e-4),
+]
+"""The last is of noise alone."""
+
+
+@pytest.mark.parametrize(("ground", "plate", "snr_db", "floor"), CASES)
+def test_the_forecast_is_what_pose_site_states(ground: bool, plate: bool, snr_db: float, floor: float) -> None:
+    scenario = site(ground=ground, plate=plate, snr_db=snr_db, floor=floor)
+    found = layout_map(scenario, estimators=["site"])
+    assert found.unsolved == ("",) * N_MIRROR
+    chosen = {"sample_rate": "64e6", "estimator": "correlator", "pose": "site"}
+    poses = [solve(measured(scenario, seed), scenario, settings=chosen).poses for seed in range(3)]
+    assert (np.array([p.status for p in poses]) == PoseStatus.OK).all()
+    ratio = 1e3 * np.array([p.sigma_rad[0] for p in poses]) / found.rms_mrad["site"]
+    # a mirror's own residuals, some twenty degrees of freedom with heavy tails, make its sigma 0.15 smaller or larger
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.1)
+    assert np.abs(np.log(np.sqrt(np.mean(ratio**2, axis=0)))).max() < 4.0 * 0.15 / np.sqrt(3.0)
