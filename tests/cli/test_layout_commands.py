@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from datetime import date
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from click.testing import CliRunner
 from rfpose.cli._support import Session
 from rfpose.cli.layout import command
 from rfpose.errors import GeometryError, ScenarioError
-from rfpose.geometry import enu_from_azimuth_elevation
+from rfpose.geometry import enu_from_azimuth_elevation, unit
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
@@ -20,7 +21,7 @@ from rfpose.measurement import noise_of
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result_summary import summarise as summarise_result
 from rfpose.pipeline.layout import Rules, budget, layout_map, optimise
-from rfpose.pipeline.layout.site import Postures
+from rfpose.pipeline.layout.site import Postures, Sight, postures_of
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
 from rfpose.scenario import load_scenario
@@ -326,3 +327,62 @@ def test_level_transmitters_are_refused(tmp_path):
 def test_constraints_that_cannot_be_met_are_refused():
     with pytest.raises((ScenarioError, GeometryError), match="no room"):
         optimise(SITE, rules=Rules(separation_m=150.0), starts=1)
+
+
+def surveyed(tmp_path, **changes):
+    """Save Table 2's site with surveyed pivots at 433 MHz."""
+    heliostats = [
+        {**h.model_dump(exclude_none=True), "pivot_sigma_m": 0.005} for h in load_scenario(SITE).heliostat[:3]
+    ]
+    return short_site(tmp_path, heliostat=heliostats, radio={"centre_frequency_hz": 433e6}, **changes)
+
+
+def test_map_of_pose_site_says_which_mirrors_it_cannot_solve(tmp_path):
+    site = surveyed(tmp_path, multipath={"foresee": ["ground"]})
+    assert "site" not in json.loads(run("map", site, "--json"))["normal_mrad"]
+    found = json.loads(run("map", site, "--json", "--estimator", "site"))
+    assert 0.5 < found["normal_mrad"]["site"]["worst"] < 20.0
+    assert "site_unsolved" not in found
+    east, north, up = load_scenario(site).heliostat[1].pivot_enu_m
+    walls = [
+        {"id": f"W{k}", "base_enu_m": (east + x, north + y, up - 5.0), "size_m": size}
+        for k, (x, y, size) in enumerate(
+            [(4, 0, (1, 9, 90)), (-4, 0, (1, 9, 90)), (0, 4, (9, 1, 90)), (0, -4, (9, 1, 90))]
+        )
+    ]
+    site = surveyed(tmp_path, multipath={"foresee": ["ground"]}, site={"structures": {"box": walls}})
+    out = tmp_path / "map.csv"
+    text = run("map", site, "--estimator", "site", "--csv", str(out))
+    assert "site: 1 heliostat not solved in every posture: fewer measurements than unknowns" in text
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["site_unsolved"][:18] for row in rows] == ["", "fewer measurements", ""]
+    assert [math.isnan(float(row["normal_site_rms_mrad"] or "nan")) for row in rows] == [False, True, False]
+
+
+def test_map_of_pose_site_refuses_what_pose_site_does(tmp_path):
+    with pytest.raises(ScenarioError, match=r"site\.toml: pose `site` .* not surveyed; give `pivot_sigma_m`"):
+        layout_map(short_site(tmp_path), estimators=["site"])
+    heliostats = [{**h.model_dump(exclude_none=True), "oscillator": "separate"} for h in load_scenario(SITE).heliostat]
+    with pytest.raises(ScenarioError, match=r"site\.toml: pose `site` compares carriers .* `H01` does not"):
+        layout_map(short_site(tmp_path, heliostat=heliostats), estimators=["site"])
+    site = surveyed(tmp_path)
+    sight = Sight(plates=Plates(width_m=3.2, height_m=2.6))
+    with pytest.raises(ScenarioError, match=r"estimator `site` foresees for itself"):
+        layout_map(site, estimators=["site"], sight=sight)
+
+
+def test_plates_take_the_posture_of_the_field(tmp_path):
+    plates = [
+        {"id": "P0", "pivot_enu_m": (10.0, 5.0, 3.0), "width_m": 3.0, "height_m": 2.0},
+        {"id": "P1", "pivot_enu_m": (20.0, 5.0, 3.0), "width_m": 3.0, "height_m": 2.0, "normal_enu": (0.0, -1.0, 1.0)},
+    ]
+    site = load_scenario(surveyed(tmp_path, site={"structures": {"plate": plates}}))
+    sun, stow = postures_of(site, Postures(suns_deg=[(120.0, 30.0)], stow=True))
+    (own,) = postures_of(site, Postures())
+    ray = enu_from_azimuth_elevation(*np.radians([120.0, 30.0]))
+    for place, normal in zip(((10.0, 5.0, 3.0), (20.0, 5.0, 3.0)), sun.plate_rot[:, :, 2], strict=True):
+        to_aim = unit(np.array(site.site.aim_enu_m) - place)
+        np.testing.assert_allclose(2.0 * (normal @ ray) * normal - ray, to_aim, atol=1e-12)
+    np.testing.assert_allclose(stow.plate_rot[:, :, 2], [[0.0, 0.0, 1.0]] * 2, atol=1e-12)
+    np.testing.assert_allclose(own.plate_rot[1, :, 2], np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0), atol=1e-12)
