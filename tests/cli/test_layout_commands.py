@@ -18,9 +18,11 @@ from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS
 from rfpose.layout.sight import Plates, visible
 from rfpose.measurement import noise_of
+from rfpose.multilat import PoseStatus
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result_summary import summarise as summarise_result
 from rfpose.pipeline.layout import Rules, budget, layout_map, optimise
+from rfpose.pipeline.layout.mapping import _reasons
 from rfpose.pipeline.layout.site import Postures, Sight, postures_of
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
@@ -358,6 +360,12 @@ def test_map_of_pose_site_says_which_mirrors_it_cannot_solve(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["site_unsolved"][:18] for row in rows] == ["", "fewer measurements", ""]
     assert [math.isnan(float(row["normal_site_rms_mrad"] or "nan")) for row in rows] == [False, True, False]
+
+
+def test_the_reason_is_of_the_first_posture_that_is_not_solved():
+    unknowns = PoseStatus.UNKNOWNS
+    reasons = _reasons(np.array([[0, unknowns, 0], [0, PoseStatus.UNCERTAIN, unknowns]]))
+    assert reasons == ("", unknowns.reason, unknowns.reason)
 
 
 def test_map_of_pose_site_refuses_what_pose_site_does(tmp_path):

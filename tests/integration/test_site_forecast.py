@@ -119,3 +119,10 @@ def test_the_forecast_is_what_pose_site_states(ground: bool, plate: bool, snr_db
     # a mirror's own residuals, some twenty degrees of freedom with heavy tails, make its sigma 0.15 smaller or larger
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.1)
     assert np.abs(np.log(np.sqrt(np.mean(ratio**2, axis=0)))).max() < 4.0 * 0.15 / np.sqrt(3.0)
+
+
+def test_mirrors_learn_the_ground_together() -> None:
+    many = site(ground=True, plate=False)
+    alone = many.changed(heliostat=many.heliostat[:1])
+    sigma = [layout_map(s, estimators=["site"]).rms_mrad["site"][0] for s in (many, alone)]
+    assert 0.9 < sigma[0] / sigma[1] < 0.97
