@@ -18,7 +18,6 @@ from rfpose.multilat.site import (
     Constants,
     FieldAt,
     ReferencePoses,
-    SiteKnowledge,
     SiteObservations,
     Survey,
     SurveyPrior,
@@ -29,7 +28,7 @@ from rfpose.pipeline.measure import measure_tones
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.postures import commanded_normals, read_postures
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.poses import check_site_solvable, rotations, settings_of
+from rfpose.pipeline.site.poses import check_site_solvable, knowledge_of, rotations, settings_of, wavenumbers_of
 from rfpose.recording import Recording, check_against, frame_starts, open_recording
 from rfpose.scenario import Scenario, scenario_of
 
@@ -185,10 +184,8 @@ def _survey_group(
     reference: tuple[FloatArray | None, float],
     on_round: Callable[[int, int], None],
 ) -> Survey:
-    n_frame = len(commanded)
-    own = commanded[:, group.column]
+    told = rotations(commanded[:, group.column].reshape(-1, 3))
     antenna = antenna_of(site)
-    pivot = np.tile(group.pivot_enu_m, (n_frame, 1))
     known = group.estimator
     first = site.heliostat[int(group.column[0])]
     given = Constants(
@@ -224,18 +221,9 @@ def _survey_group(
         SiteObservations(
             carrier=np.concatenate([group.of_mirrors(p.carrier) for p in parts]),
             sigma=np.concatenate([group.of_mirrors(p.sigma) for p in parts]),
-            wavenumber_radpm=2.0 * np.pi * site.carrier_rf_hz / site.radio.propagation_speed_mps,
+            wavenumber_radpm=wavenumbers_of(site),
         ),
-        SiteKnowledge(
-            receiver_mirror_m=np.tile(group.places_m, (n_frame, 1, 1)),
-            pivot_enu_m=pivot,
-            pivot_sigma_m=known.pivot_sigma_m,
-            commanded_rot=rotations(own.reshape(-1, 3)),
-            posture_sigma_rad=np.full(len(pivot), site.posture.sigma_rad),
-            roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
-            clock_sigma_m=known.clock_sigma_m,
-            unit_field=antenna.strength / np.linalg.norm(site.transmitter_enu_m - pivot[:, None], axis=2),
-        ),
+        knowledge_of(site, group, told, np.full(len(told), site.posture.sigma_rad), antenna),
         given,
         field_for,
         prior=SurveyPrior(
