@@ -25,7 +25,7 @@ _WORDS = {
     "track": "a run of `rfpose track`, which `rfpose info` and `rfpose view` take",
     "model": "a file of mounts, which `rfpose aim`, `rfpose calibrate` and `rfpose info` take",
     "antenna": "an antenna pattern, which `rfpose info` takes",
-    "survey": "a survey, which `rfpose process --survey` takes",
+    "survey": "a survey, which `rfpose process` takes beside a recording",
     "scenario": "a scenario, which `rfpose simulate`, `rfpose layout`, `rfpose track` and `rfpose info` take",
     "truth": "a truth, which `rfpose evaluate` takes beside a result",
 }
