@@ -48,6 +48,9 @@ LEAST_LOSS_S_PER_M = 3e-5
 BASE_M = 0.01
 """Boxes begin so far above the ground, where faces would coincide."""
 SAMPLES = {"direct": 100_000, "ground": 100_000}
+EDGE_SAMPLES = 3_000_000
+"""Edges are found by rays that happen to hit beside them: so many find those of a 2 m plate 100 m away
+(findings/sionna-rt-edges-missed.sh)."""
 METAL = (1.0, 1e7)
 _REFLECTED, _DIFFRACTED = 1, 8
 
@@ -206,7 +209,7 @@ def _solve(site: rf.Scenario, receiver: Array, things: list[Thing], what: str) -
     paths = PathSolver()(
         scene,
         max_depth={"direct": 0, "ground": 1}.get(what, 2),
-        samples_per_src=SAMPLES.get(what, 300_000),
+        samples_per_src=EDGE_SAMPLES if edges else SAMPLES.get(what, 300_000),
         refraction=False,
         synthetic_array=True,
         diffraction=edges,
