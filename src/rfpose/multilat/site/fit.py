@@ -61,8 +61,6 @@ _LEARN_ROUNDS = 15
 _LEARN_SETTLED = 0.03
 _LOST = 9.0
 """A mirror whose stray field is so much stronger than the middle one's, in power, tells no more of it than that."""
-_LAST_ROUNDS = 2
-"""How often rays are foreseen anew once that is learned."""
 _LEARN_MIRRORS = 200
 """Mirrors, spread over all, from which is found what all have in common."""
 _LEAST_FACTOR_SCALE = 0.01
@@ -336,8 +334,9 @@ def fit_site(
         common = fit.learn(_field_of(field_at, state, some, common), state, some, common)
         state = fit.run(fit.prepare(_field_of(field_at, state, some, common)), state, some, common)
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, everyone, common), everyone, common)
-    for _ in range(_LAST_ROUNDS):
-        state = fit.run(fit.prepare(_field_of(field_at, state, everyone, common)), state, everyone, common)
+    # on the way there the ground counts as known: what it is uncertain by takes as long to foresee as all the rest
+    for ground in (replace(common, soil_sigma=(0.0, 0.0)), common):
+        state = fit.run(fit.prepare(_field_of(field_at, state, everyone, ground)), state, everyone, ground)
     return fit.outcome(state, known, common)
 
 
