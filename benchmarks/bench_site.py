@@ -2,8 +2,9 @@
 
 python benchmarks/bench_site.py [--mirrors 10000]
 
-Mirrors of 2 m stand 8 m apart, three receivers before each, ten transmitters, a tower, a Fresnel ground. Carriers are the
-sums of the foreseen rays with a stray field of 3 % of the direct one; commanded postures are off by 10 mrad about each axis.
+Mirrors of 2 m stand 8 m apart, three receivers before each, ten transmitters, a tower, a Fresnel ground. Carriers are
+the sums of the foreseen rays with a stray field of 3 % of the direct one; commanded postures are off by 10 mrad about
+each axis.
 """
 
 from __future__ import annotations
