@@ -14,6 +14,7 @@ _SETTLED_WEIGHT = 5e-2
 _ENDED_SIGMAS = 0.2
 """A fit that reweighting still moves by less than this is taken as it is: weights settle slowly."""
 _MIN_STEPS = 5
+_PATIENT_STEPS = 30
 _FREE = 1e-3
 """Information on what nothing is known of, so that equations stay regular: 30 m, 30 rad."""
 
@@ -488,7 +489,8 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
             for p in range(6 + n_tx):
                 for q in range(6 + n_tx):
                     length += gradient[p, 0] * normal[p, q] * gradient[q, 0]
-            shrink = min(1.0, _MAX_STEP_RAD / max(angle, 1e-300))
+            # a fit that goes to and fro between two poses is brought to rest between them
+            shrink = min(1.0 if n_step < _PATIENT_STEPS else 0.5, _MAX_STEP_RAD / max(angle, 1e-300))
             turn(shrink * gradient[:3, 0], step_rot)
             rot = step_rot @ rot
             for q in range(3):
