@@ -17,6 +17,7 @@ __all__ = [
     "angle_between_rad",
     "azimuth_elevation_from_enu",
     "bisector_enu",
+    "cross_matrix",
     "enu_from_azimuth_elevation",
     "is_collinear",
     "rot_enu_from_mirror",
@@ -154,3 +155,12 @@ def is_collinear(points_m: npt.ArrayLike, *, tolerance: float = 1e-3) -> bool:
         raise GeometryError(f"`points_m` must hold three or more points, got {len(p)}")
     extent = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
     return bool(extent[1] <= tolerance * max(extent[0], np.finfo(float).tiny))
+
+
+def cross_matrix(vector: FloatArray) -> FloatArray:
+    """Return the matrices (..., 3, 3) with ``matrix @ x = vector × x``."""
+    out = np.zeros((*vector.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -vector[..., 2], vector[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = vector[..., 2], -vector[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -vector[..., 1], vector[..., 0]
+    return out

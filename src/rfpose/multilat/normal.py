@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.geometry import azimuth_elevation_from_enu, is_collinear
+from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix, is_collinear
 from rfpose.multilat import _kernels
 from rfpose.multilat.fix import Fixes, FixStatus, Side, check_transmitters, locate
 from rfpose.multilat.status import PoseStatus
@@ -196,7 +196,7 @@ def _cross_product(centred: FloatArray, a: FloatArray, b: FloatArray) -> tuple[F
     length = np.linalg.norm(cross, axis=1)
     normal = cross / length[:, None]
     # d(p × q) = dp × q + p × dq = −[q]× dp + [p]× dq, then only what is across the normal
-    jacobian = np.einsum("nij,k->nikj", -_skew(q), a) + np.einsum("nij,k->nikj", _skew(p), b)
+    jacobian = np.einsum("nij,k->nikj", -cross_matrix(q), a) + np.einsum("nij,k->nikj", cross_matrix(p), b)
     across = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / length[:, None, None]
     return normal, across @ jacobian.reshape(len(centred), 3, -1)
 
@@ -217,13 +217,6 @@ def _least_squares(centred: FloatArray, size: FloatArray, axes: FloatArray) -> t
         change = along[:, :, None] * normal[:, None, :] + height[:, :, None] * e[:, None, :]
         jacobian += e[:, :, None, None] * (change / (size[:, 0] - size[:, other])[:, None, None])[:, None]
     return normal, jacobian.reshape(len(centred), 3, -1)
-
-
-def _skew(v: FloatArray) -> FloatArray:
-    """(..., 3, 3) matrix [v]× with [v]× w = v × w."""
-    zero = np.zeros_like(v[..., 0])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], axis=-2)
 
 
 def _affine_rows(mirror: FloatArray) -> tuple[FloatArray, FloatArray]:

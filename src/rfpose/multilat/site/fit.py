@@ -30,6 +30,7 @@ from scipy.special import fdtri, gammaln
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
+from rfpose.geometry import cross_matrix
 from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.multilat.site import _kernels
 from rfpose.multilat.status import PoseStatus
@@ -264,7 +265,7 @@ class SitePoses:
     @property
     def normal_cov(self) -> FloatArray:
         """(mirror, 3, 3) covariance of the normals [rad²]."""
-        cross = _cross(self.normal_enu)
+        cross = cross_matrix(self.normal_enu)
         return np.asarray(cross @ self.cov[:, 3:, 3:] @ cross.swapaxes(1, 2))
 
 
@@ -666,9 +667,7 @@ class _Fit:
         normal_cov = poses.normal_cov
         sigma = np.sqrt(np.trace(normal_cov, axis1=1, axis2=2))
         worst = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(normal_cov))[:, -1])
-        freedom = np.fmax(np.nan_to_num(state.dof), 1.0) + (
-            0.0 if np.isinf(self.settings.own_scale) else self.settings.own_scale
-        )
+        freedom = np.fmax(np.nan_to_num(state.dof), 1.0) + self._own_scale
         level = worst * np.sqrt(2.0 * fdtri(2.0, freedom, 1.0 - self.settings.missed_detection))
         status[~(sigma <= MAX_SIGMA_RAD)] = PoseStatus.UNCERTAIN
         status[state.ambiguous] = PoseStatus.AMBIGUOUS
@@ -821,9 +820,3 @@ class _Prepared:
             amplitude_error=np.ascontiguousarray(amplitude), phase_error=np.ascontiguousarray(phase),
             soil_error=np.array(common.soil_sigma), reference_rot=voltages.reference_rot,
         )  # fmt: skip
-
-
-def _cross(v: FloatArray) -> FloatArray:
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return out - out.swapaxes(1, 2)

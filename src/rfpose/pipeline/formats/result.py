@@ -17,6 +17,7 @@ from rfpose.dsp import Calibration, TonePhases
 from rfpose.errors import InvalidInputError
 from rfpose.foreign import exact_number
 from rfpose.multilat import RangeDifferences
+from rfpose.multilat.integrity import IntegrityStatus
 from rfpose.scenario import Scenario
 from rfpose.shown import Shown, counted, number
 from rfpose.tables import data_frame
@@ -155,6 +156,23 @@ class IntegrityTable:
     probability: FloatArray
     protection_level_rad: FloatArray
     worst_transmitter: npt.NDArray[np.int16]
+
+    @staticmethod
+    def unsolved(scenario: Scenario, n_frame: int) -> dict[str, npt.NDArray[Any]]:
+        """Return the columns of a recording in which no mirror is solved yet, to be written into."""
+        mirror = (n_frame, len(scenario.heliostat))
+        n_transmitter = len(scenario.transmitter)
+        return {
+            "status": np.full(mirror, IntegrityStatus.NOT_SOLVED, np.int8),
+            "transmitter_status": np.zeros((*mirror, n_transmitter), np.int8),
+            "used": np.zeros((n_frame, len(scenario.receivers), n_transmitter), np.bool_),
+            "prior_rejected": np.zeros((*mirror, 3), np.bool_),
+            "prior_testable": np.zeros((*mirror, 3), np.bool_),
+            "probability_all": np.full(mirror, np.nan),
+            "probability": np.full(mirror, np.nan),
+            "protection_level_rad": np.full(mirror, np.nan),
+            "worst_transmitter": np.full(mirror, -1, np.int16),
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.geometry import azimuth_elevation_from_enu
+from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix
 from rfpose.multilat import Motion, PoseStatus, TrackStatus, track_poses
 from rfpose.multilat.estimation import Found
-from rfpose.multilat.integrity import IntegrityStatus
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -46,24 +45,14 @@ class Tables:
         scenario, choice = stages.scenario, stages.choice
         n_frame = self._n_frame = len(stages.tones.frame_start_index)
         frame_mirror = (n_frame, len(scenario.heliostat))
-        n_receiver, n_transmitter = len(scenario.receivers), len(scenario.transmitter)
+        n_receiver = len(scenario.receivers)
         self._poses = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
         for values in self._poses.values():
             if values.dtype.kind == "f":
                 values[:] = np.nan
         self._integrity: dict[str, npt.NDArray[Any]] = {}
         if choice.integrity:
-            self._integrity = {
-                "status": np.full(frame_mirror, IntegrityStatus.NOT_SOLVED, np.int8),
-                "transmitter_status": np.zeros((*frame_mirror, n_transmitter), np.int8),
-                "used": np.zeros((n_frame, n_receiver, n_transmitter), np.bool_),
-                "prior_rejected": np.zeros((*frame_mirror, 3), np.bool_),
-                "prior_testable": np.zeros((*frame_mirror, 3), np.bool_),
-                "probability_all": np.full(frame_mirror, np.nan),
-                "probability": np.full(frame_mirror, np.nan),
-                "protection_level_rad": np.full(frame_mirror, np.nan),
-                "worst_transmitter": np.full(frame_mirror, -1, np.int16),
-            }
+            self._integrity = IntegrityTable.unsolved(scenario, n_frame)
         self._reflection: dict[str, npt.NDArray[Any]] = {}
         if choice.reflection != "none":
             n_plane = 1 + len(scenario.reflection.plane)
@@ -99,7 +88,7 @@ class Tables:
         poses = found.poses
         normal = poses.normal_enu
         azimuth, elevation = azimuth_elevation_from_enu(normal)
-        cross = _cross_matrix(normal)
+        cross = cross_matrix(normal)
         places = np.tile(group.places_m, (self._n_frame, 1, 1))
         self._put(
             self._poses,
@@ -170,7 +159,7 @@ class Tables:
                 max_coast_s=np.inf if table.max_coast_s is None else table.max_coast_s,
             ),
         )
-        cross = _cross_matrix(tracked.normal_enu)
+        cross = cross_matrix(tracked.normal_enu)
         values = {
             "normal_enu": tracked.normal_enu,
             "cov_enu": cross @ tracked.cov[..., 3:6, 3:6] @ cross.swapaxes(-1, -2),
@@ -262,13 +251,4 @@ def _observed_clocks(problem: MirrorProblem, n_class: int) -> BoolArray:
     out = np.zeros((len(seen), n_class, seen.shape[2]), np.bool_)
     for k, clock in enumerate(problem.clock_class):
         out[:, clock] |= seen[:, k]
-    return out
-
-
-def _cross_matrix(v: FloatArray) -> FloatArray:
-    """(…, 3, 3) with ``m @ x = v × x``."""
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
     return out

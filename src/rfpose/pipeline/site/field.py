@@ -17,7 +17,7 @@ from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.mirrors import MirrorGroup
 from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, foresee
 from rfpose.propagation.site import place_things
-from rfpose.scenario import Heliostat, Scenario
+from rfpose.scenario import Scenario
 
 __all__ = ["ReceivingAntenna", "SiteField", "antenna_of"]
 
@@ -147,28 +147,29 @@ class PatternAntenna:
         return (field * vector).sum(axis=1), out, sigma * np.linalg.norm(field, axis=1)
 
 
-def antenna_of(scenario: Scenario, heliostat: Heliostat | None = None) -> ReceivingAntenna:
-    """Return the antennas of a heliostat's mirror, by default the first one's, from ``[antenna]``.
+def antenna_of(scenario: Scenario) -> ReceivingAntenna:
+    """Return the antennas of a scenario's mirrors, from ``[antenna]``.
 
     Raises
     ------
     ScenarioError
-        A pattern of other receivers than the mirror's.
+        A pattern of other receivers than those of a mirror.
     RecordingError
         The pattern's file is missing or damaged.
     """
     table = scenario.antenna
-    mirror = scenario.heliostat[0] if heliostat is None else heliostat
-    places = np.array(mirror.receiver_mirror_m)
     if table.pattern is not None:
         pattern = read_pattern(table.pattern).pattern
         try:
-            pattern.check_receivers(places)
+            for heliostat in scenario.heliostat:
+                pattern.check_receivers(heliostat.receiver_mirror_m)
             return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
         except InvalidInputError as error:
-            raise ScenarioError(f"{table.pattern}, heliostat `{mirror.id}`: {error}") from error
+            raise ScenarioError(f"{table.pattern}, scenario `{scenario.name}`: {error}") from error
     if table.receiver == "dipole":
         mean_hz = float(scenario.carrier_rf_hz.mean())
+        # alike in all places: as many as the mirror with most receivers has
+        places = max((heliostat.receiver_mirror_m for heliostat in scenario.heliostat), key=len)
         pattern = dipole_pattern(places, table.axis_mirror, mean_hz)
         return PatternAntenna.of(pattern, np.full(len(scenario.transmitter), mean_hz), holds_own_plate=False)
     return VerticalAntenna()

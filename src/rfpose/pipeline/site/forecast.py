@@ -60,12 +60,12 @@ def forecast_normals(
         The pattern's file is missing or damaged.
     """
     check_site_solvable(scenario)
-    antenna = antenna_of(scenario)
     noise = noise_of(scenario, tone_snr_db=tone_snr_db)
     assert noise.carrier_sigma_m is not None  # or no carrier could be compared
     wavenumber = wavenumbers_of(scenario)
     sigma_rad = np.full(len(scenario.heliostat), np.nan)
     status = np.full(len(scenario.heliostat), PoseStatus.NO_POSTURE, np.int64)
+    antenna = antenna_of(scenario)
     for group in mirror_groups(scenario):
         known = knowledge_of(
             scenario,

@@ -79,8 +79,8 @@ def solve_site_poses(
     unix_s = np.array([float(Fraction(int(s)) / sample_rate) for s in tones.frame_start_index])
     commanded = commanded_normals(scenario, unix_s, simulated=simulated)
     tables = _Tables(tones, scenario, cold)
+    antenna = antenna_of(scenario)
     for group in mirror_groups(scenario):
-        antenna = antenna_of(scenario, scenario.heliostat[group.column[0]])
         tables.put(group, _solve_group(tones, scenario, group, commanded, cold, antenna))
     return tables.outcome()
 
@@ -177,17 +177,7 @@ class _Tables:
         self._poses = {name: np.array(getattr(cold, name)) for name in PoseTable.__dataclass_fields__}
         for values in self._poses.values():
             values[:] = np.nan if values.dtype.kind == "f" else 0
-        self._integrity: dict[str, npt.NDArray[Any]] = {
-            "status": np.full(mirror, IntegrityStatus.NOT_SOLVED, np.int8),
-            "transmitter_status": np.zeros((*mirror, len(scenario.transmitter)), np.int8),
-            "used": np.zeros(link, np.bool_),
-            "prior_rejected": np.zeros((*mirror, 3), np.bool_),
-            "prior_testable": np.zeros((*mirror, 3), np.bool_),
-            "probability_all": np.full(mirror, np.nan),
-            "probability": np.full(mirror, np.nan),
-            "protection_level_rad": np.full(mirror, np.nan),
-            "worst_transmitter": np.full(mirror, -1, np.int16),
-        }
+        self._integrity = IntegrityTable.unsolved(scenario, n_frame)
         self._site: dict[str, npt.NDArray[Any]] = {
             "weight": np.full(link, np.nan),
             "residual_rad": np.full(link, np.nan),
