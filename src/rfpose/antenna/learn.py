@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
 
 from rfpose.antenna.currents import Currents, MirrorType
 from rfpose.antenna.pattern import AntennaPattern
@@ -326,6 +325,8 @@ class _Problem:
         self._direction = np.einsum("nji,nj->ni", rot, towards / length[:, None])
         self._field = np.einsum("nji,nj->ni", rot, rays.field_enu) * turned[:, None]
         self._place = rays.place_mirror_m
+        from scipy.sparse import csr_array  # learning alone needs it, and all processing loads this package
+
         self._sum = csr_array((np.ones(rays.n_ray), np.arange(rays.n_ray), rays.first), shape=(n_link, rays.n_ray))
 
     def _design(self) -> ComplexArray:

@@ -36,7 +36,9 @@ class Rays:
     one list serves all poses near the one it was made for: a mirror image stays where it is while the receiver moves,
     and a ray from the mirror's own plate is that of a receiver mirrored in it (``place`` differs from the receiver's).
     The field that a link receives is the sum over its rays of ``field[k] · exp(−j 2π/λ path)``, weighed by the
-    antenna's response to the direction from which the ray comes, ``source[k] − (p + R place[k])`` in the mirror frame.
+    antenna's response to the direction from which the ray comes: ``source[k] − (p + R place[k])`` in the mirror frame.
+    A ray from the mirror's own plate (``place`` differs from the receiver's) arrives elsewhere: from the mirror image
+    of that direction in the plate, or, bent, from its edge, where ``place`` is.
 
     Attributes
     ----------

@@ -243,14 +243,17 @@ class SiteField:
         if things.soil is None or not self._options.ground:
             return out
         other = self._rays(stand, _with_soil(things, complex(_SOIL_STEP), self._scenario))
-        if other.n_ray != rays.n_ray or not np.array_equal(other.kind, rays.kind):
-            # a ray on the verge of being too faint: its mirrors do without
-            return out
-        strongest = np.argmax(np.abs(rays.field_enu), axis=1)
-        k = np.arange(rays.n_ray)
+        count = np.diff(rays.first)
+        # a ray on the verge of being too faint is in one list alone: its link does without
+        alike = count == np.diff(other.first)
+        mine, theirs = np.repeat(alike, count), np.repeat(alike, np.diff(other.first))
+        before, after = rays.field_enu[mine], other.field_enu[theirs]
+        strongest = np.argmax(np.abs(before), axis=1)
+        k = np.arange(len(before))
         with np.errstate(invalid="ignore", divide="ignore"):
-            change = other.field_enu[k, strongest] / rays.field_enu[k, strongest] - 1.0
-        return np.where(np.isfinite(change), change / _SOIL_STEP, 0.0)
+            change = (after[k, strongest] / before[k, strongest] - 1.0) / _SOIL_STEP
+        out[mine] = np.where(np.isfinite(change), change, 0.0)
+        return out
 
 
 def _towards(rays: Rays, pivot: FloatArray, rot: FloatArray, receiver_mirror_m: FloatArray) -> FloatArray:
