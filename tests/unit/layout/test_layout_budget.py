@@ -139,7 +139,7 @@ def test_beam_turns_by_twice_the_normal_in_the_plane_of_incidence():
     scenario = site(n_heliostat=3)
     plan = plan_of(scenario)
     aim = np.array(scenario.site.aim_enu_m)
-    slope = target_slope(plan, aim)
+    slope = target_slope(plan.mirrors, aim)
     distance = np.linalg.norm(aim - plan.mirrors.pivot_enu_m, axis=1)
     for m, rot in enumerate(plan.mirrors.rot_enu_from_mirror):
         beam = (aim - plan.mirrors.pivot_enu_m[m]) / distance[m]

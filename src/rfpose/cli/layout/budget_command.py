@@ -45,10 +45,11 @@ def _say_where_not_linear(line: dict[str, Any], n_draw: int) -> None:
         "rfpose layout budget site.toml",
         "rfpose layout budget site.toml --sun 120 30 --sun 180 60 -o budget.csv --picture budget.png",
         "rfpose layout budget site.toml --ground estimated --draws 50",
+        "rfpose layout budget site.toml --pose site --draws 50",
     ),
 )
 @click.argument("scenario", type=click.Path(path_type=Path))
-@click.option("--pose", type=click.Choice(("rigid", "independent")), default="rigid", show_default=True)
+@click.option("--pose", type=click.Choice(("rigid", "independent", "site")), default="rigid", show_default=True)
 @click.option("--ground", type=click.Choice(("ignored", "known", "estimated")), help="Instead of [budget] `ground`.")
 @click.option("--draws", type=click.IntRange(min=0), default=200, show_default=True,
               help="Frames of the Monte Carlo for each line; 0 for none.")  # fmt: skip

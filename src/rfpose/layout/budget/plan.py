@@ -28,7 +28,7 @@ from rfpose.multilat.rigid import MirrorProblem
 from rfpose.multilat.rigid.integers import solve_ladder
 from rfpose.scenario import Scenario
 
-__all__ = ["Plan", "make_plan"]
+__all__ = ["Plan", "converter_share_of", "make_plan"]
 
 _STEP_M = 1e-3
 _COEFFICIENT_STEP = 1e-4
@@ -258,7 +258,7 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
         calibration_thermal_m=read_only(
             noise.tone_sigma_m * noise.loss(transmitter, scenario.calibration_enu_m)[:, None]
         ),
-        converter_share=_converter_share(scenario, receiver),
+        converter_share=converter_share_of(scenario, receiver),
         by_place=np.empty(0),
         by_transmitter=np.empty(0),
         calibration_by_place=np.empty(0),
@@ -286,8 +286,15 @@ def _estimator(scenario: Scenario, pose: str) -> Estimator:
     return next(iter(kinds))
 
 
-def _converter_share(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
-    """Variance of a converter's rounding over that of thermal noise; see docs/simulation.md."""
+def converter_share_of(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
+    """Return the variance of a converter's rounding over that of thermal noise; see docs/simulation.md.
+
+    Parameters
+    ----------
+    scenario
+    receiver_enu_m : (..., xyz)
+        Mirrors' receivers [m].
+    """
     plan = scenario.simulation
     if plan.sample_format != "int16":
         return 0.0

@@ -14,6 +14,7 @@ import numpy as np
 from rfpose.checks import FloatArray
 from rfpose.layout.budget.plan import Plan
 from rfpose.layout.budget.world import World
+from rfpose.scenario import Scenario
 
 __all__ = ["SOURCES", "Effect", "Source"]
 
@@ -35,6 +36,14 @@ class Effect:
     slope: FloatArray
     common: bool = False
     past_solver: bool = False
+
+
+class Described(Protocol):
+    """A working point of any estimator, as far as its site says it all."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The site."""
 
 
 class Source(Protocol):
@@ -79,7 +88,7 @@ class Thermal:
     name = "thermal noise"
     remedy = "longer frames or several of them (error falls as 1/√time), more power, a shorter wavelength"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         s = plan.scenario
         return f"{s.simulation.tone_snr_db:g} dB a sample, {s.radio.frame_samples} samples"
 
@@ -183,7 +192,7 @@ class TransmitterSurvey:
     name = "transmitter survey"
     remedy = "survey the antennas better, or solve for them from many mirrors' poses"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         sigma_mm = 1e3 * plan.scenario.budget.transmitter_survey_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
@@ -243,7 +252,7 @@ class ReceiverPlaces:
     name = "receiver places"
     remedy = "measure the receivers on the mirror better, set them farther apart; constant, so calibration takes it out"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         sigma_mm = 1e3 * plan.scenario.budget.receiver_mirror_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
@@ -263,7 +272,7 @@ class Misalignment:
     name = "receiver plane to glass"
     remedy = "calibrate against a camera or the sun once; constant for a mirror"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         sigma = plan.scenario.budget.receiver_plane_sigma_mrad
         return f"{sigma:.3g} mrad about each axis" if sigma > 0.0 else ""
 
@@ -421,12 +430,13 @@ class Motion:
     name = "motion in a frame"
     remedy = "shorter frames, or predict the pose from the drive's rate"
 
-    def _angle_rad(self, plan: Plan) -> float:
+    def angle_rad(self, plan: Described) -> float:
+        """Return by how much the normal turns."""
         s = plan.scenario
         frame_s = s.radio.frame_samples / s.radio.sample_rate_hz
         return 1e-3 * s.budget.mirror_rate_mrad_per_s * (0.5 * frame_s + s.budget.latency_s)
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         rate, latency = plan.scenario.budget.mirror_rate_mrad_per_s, plan.scenario.budget.latency_s
         if rate == 0.0:
             return ""
@@ -434,7 +444,7 @@ class Motion:
         return f"{rate:.3g} mrad/s, frame of {1e3 * frame_s:g} ms" + (f", {latency:g} s later" if latency else "")
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
-        return [_turned(plan, by_range, self._angle_rad(plan) / np.sqrt(2.0))]
+        return [_turned(plan, by_range, self.angle_rad(plan) / np.sqrt(2.0))]
 
     def disturb(self, world: World) -> None:
         direction = 2.0 * np.pi * world.rng.random(world.glass_tilt_rad.shape[:2])
@@ -450,28 +460,29 @@ class Wavelength:
     name = "wavelength (air)"
     remedy = "set `propagation_speed_mps` to that of the site's air, from temperature, pressure and humidity"
 
-    def _sigma(self, plan: Plan) -> float:
+    def sigma(self, plan: Described) -> float:
+        """Return the relative error of all ranges."""
         stated = plan.scenario.budget.refractivity_sigma_ppm
         vacuum = plan.scenario.radio.propagation_speed_mps == 299_792_458.0
         return 1e-6 * ((300.0 if vacuum else 20.0) if stated is None else stated)
 
-    def assumed(self, plan: Plan) -> str:
-        sigma = self._sigma(plan)
+    def assumed(self, plan: Described) -> str:
+        sigma = self.sigma(plan)
         return f"refractive index to {1e6 * sigma:g} ppm" if sigma > 0.0 else ""
 
     def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         transmitter = plan.scenario.transmitter_enu_m
         distance = np.linalg.norm(plan.mirrors.receiver_enu_m[:, :, None] - transmitter, axis=-1)
         slope = np.einsum("magrt,mrt->ma", by_range, distance)[..., None]
-        found = [self._sigma(plan) * slope]
+        found = [self.sigma(plan) * slope]
         if _calibrated(plan):
             there = np.linalg.norm(plan.scenario.calibration_enu_m[:, None] - transmitter, axis=-1)
             root = np.repeat(there[:, None, :, None], plan.waves.n_tone, axis=1)
-            found.append(_of_calibration(plan, by_range, self._sigma(plan) * root).slope)
+            found.append(_of_calibration(plan, by_range, self.sigma(plan) * root).slope)
         return [Effect(np.sum(found, axis=0), common=True)]
 
     def disturb(self, world: World) -> None:
-        world.range_scale += self._sigma(world.plan) * world.normal(world.n_draw)
+        world.range_scale += self.sigma(world.plan) * world.normal(world.n_draw)
 
 
 SOURCES: tuple[Source, ...] = (

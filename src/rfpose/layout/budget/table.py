@@ -14,6 +14,7 @@ from rfpose.layout.budget.plan import Plan
 from rfpose.layout.budget.sources import SOURCES, Effect, Source
 from rfpose.layout.budget.world import World
 from rfpose.layout.gain import Gain
+from rfpose.layout.maps import Mirrors
 
 __all__ = ["BudgetLine", "ErrorBudget", "error_budget", "noise_bound", "target_slope"]
 
@@ -58,15 +59,18 @@ class ErrorBudget:
         Linear: the root of the sum of squares of the lines. Drawn: all sources at once.
     n_draw, n_failed
         Frames drawn for each line; solutions that failed among all of them.
-    plan
-        The working point.
+    pose
+        Which estimator: ``rigid``, ``independent`` or ``site``.
+    wavelength_m
+        Those that it uses, means over the transmitters [m].
     """
 
     lines: tuple[BudgetLine, ...]
     whole: BudgetLine
     n_draw: int
     n_failed: int
-    plan: Plan
+    pose: str
+    wavelength_m: tuple[float, ...]
 
 
 def error_budget(
@@ -103,7 +107,7 @@ def error_budget(
     if n_draw < 0:
         raise InvalidInputError(f"`n_draw` must not be negative, got {n_draw}")
     gain = plan.gain()
-    to_target = target_slope(plan, aim_enu_m)
+    to_target = target_slope(plan.mirrors, aim_enu_m)
     sources = [s for s in SOURCES if s.assumed(plan)]
     streams = np.random.SeedSequence(seed).spawn(len(SOURCES) + 1)
     lines, total, n_failed = [], np.zeros((len(plan.mirrors.pivot_enu_m), 2, 2)), 0
@@ -112,15 +116,21 @@ def error_budget(
         total += linear
         drawn, failed = _draw(plan, [source], n_draw, streams[SOURCES.index(source)])
         n_failed += failed
-        lines.append(_line(source.name, source.assumed(plan), source.remedy, linear, drawn, to_target))
+        lines.append(budget_line(source.name, source.assumed(plan), source.remedy, linear, drawn, to_target))
         if progress is not None:
             progress(k + 1, len(sources) + 1)
     drawn, failed = _draw(plan, sources, n_draw, streams[-1])
-    whole = _line("all together", "", "", total, drawn, to_target)
+    whole = budget_line("all together", "", "", total, drawn, to_target)
     if progress is not None:
         progress(len(sources) + 1, len(sources) + 1)
-    lines.sort(key=lambda line: -float(np.sum(np.nan_to_num(line.normal_rad) ** 2)))
-    return ErrorBudget(lines=tuple(lines), whole=whole, n_draw=n_draw, n_failed=n_failed + failed, plan=plan)
+    return ErrorBudget(
+        lines=worst_first(lines),
+        whole=whole,
+        n_draw=n_draw,
+        n_failed=n_failed + failed,
+        pose="rigid" if plan.estimator.rigid else "independent",
+        wavelength_m=tuple(float(row.mean()) for row in plan.waves.wavelength_m),
+    )
 
 
 def noise_bound(plan: Plan) -> FloatArray:
@@ -131,13 +141,12 @@ def noise_bound(plan: Plan) -> FloatArray:
     return np.asarray(np.sqrt(np.trace(plan.gain().cov, axis1=1, axis2=2)))
 
 
-def target_slope(plan: Plan, aim_enu_m: npt.ArrayLike | None) -> FloatArray:
+def target_slope(mirrors: Mirrors, aim_enu_m: npt.ArrayLike | None) -> FloatArray:
     """Return (mirror, xyz, xy): where the beam meets the target, by the normal's error along the mirror's axes [m/rad].
 
     The beam to the aim point turns by 2 (n·s) δn + 2 (δn·s) n, s towards the sun: twice δn in the plane of incidence,
     less by the cosine of the angle of incidence across it.
     """
-    mirrors = plan.mirrors
     if aim_enu_m is None:
         return np.full((len(mirrors.pivot_enu_m), 3, 2), np.nan)
     aim = as_float_array("aim_enu_m", aim_enu_m, (3,)) - mirrors.pivot_enu_m
@@ -202,9 +211,16 @@ def _draw(plan: Plan, sources: Sequence[Source], n_draw: int, stream: np.random.
         return total / np.where(count > 0, count, np.nan)[:, None, None], int(n_draw * n_mirror - count.sum())
 
 
-def _line(
+def worst_first(lines: Sequence[BudgetLine]) -> tuple[BudgetLine, ...]:
+    """Return lines by how much they do to the whole field."""
+    return tuple(sorted(lines, key=lambda line: -float(np.sum(np.nan_to_num(line.normal_rad) ** 2))))
+
+
+def budget_line(
     name: str, assumed: str, remedy: str, linear: FloatArray, drawn: FloatArray, to_target: FloatArray
 ) -> BudgetLine:
+    """Return a line from mean squares of the normal's error along the mirror's axes (mirror, 2, 2) [rad²]."""
+
     def normal(cov: FloatArray) -> FloatArray:
         return read_only(np.sqrt(np.trace(cov, axis1=1, axis2=2)))
 

@@ -9,9 +9,9 @@ from rfpose.multilat.site.fit import (
     SiteSettings,
     Voltages,
     fit_site,
-    forecast_site,
     spread_starts,
 )
+from rfpose.multilat.site.forecast import Disturbance, ForeseenMirrors, forecast_site
 from rfpose.multilat.site.survey import (
     CASES,
     Constants,
@@ -26,7 +26,9 @@ __all__ = [
     "CASES",
     "Common",
     "Constants",
+    "Disturbance",
     "FieldAt",
+    "ForeseenMirrors",
     "ReferencePoses",
     "SiteKnowledge",
     "SiteObservations",

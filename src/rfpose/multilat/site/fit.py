@@ -45,7 +45,6 @@ __all__ = [
     "SiteSettings",
     "Voltages",
     "fit_site",
-    "forecast_site",
     "heard_by",
     "spread_starts",
 ]
@@ -344,65 +343,6 @@ def fit_site(
 def heard_by(voltages: Voltages, shape: tuple[int, ...], settings: SiteSettings, common: Common) -> _kernels.Heard:
     """Return voltages of (mirror, receiver, transmitter) as the kernels take them."""
     return _Prepared.of(voltages, shape).heard(settings, common)
-
-
-def forecast_site(
-    sigma: FloatArray,
-    wavenumber_radpm: FloatArray,
-    knowledge: SiteKnowledge,
-    field_at: FieldAt,
-    settings: SiteSettings | None = None,
-) -> SitePoses:
-    """Return what `fit_site` would state of mirrors that stand as commanded, from what they are expected to receive.
-
-    Nothing is learned but the ground's permittivity, from all these mirrors: what nothing foresees is as strong as
-    ``settings.floor`` says (None: 0.05 of the direct field) and has Student's distribution of ``settings.tail`` (None:
-    3) degrees of freedom; rays' factors are as uncertain as given. Poses are taken to be found: whether a second one
-    fits alike is not asked.
-
-    Parameters
-    ----------
-    sigma : (mirror, receiver, transmitter)
-        Standard deviation of the real part of each carrier, in units of the voltages.
-    wavenumber_radpm : (transmitter,)
-        2π/λ of each carrier [rad/m].
-    knowledge, field_at, settings
-        As `fit_site` has them.
-
-    Raises
-    ------
-    InvalidInputError
-        Arrays that do not fit each other.
-    """
-    chosen = settings or SiteSettings()
-    known, everyone, some = _who(knowledge)
-    common, state = _given(chosen), _State.begin(knowledge)
-    voltages = _field_of(field_at, state, everyone, common)
-    carrier = _received(voltages, wavenumber_radpm, knowledge)
-    # one step from the truth: residuals are zero, so that links keep the weight that they have on average
-    fit = _Fit(
-        SiteObservations(carrier=carrier, sigma=sigma, wavenumber_radpm=wavenumber_radpm),
-        knowledge,
-        chosen,
-        max_steps=1,
-    )
-    prepared, told = fit.prepare(voltages), _Told.of(len(known))
-    fit.run(prepared, state, some, common, told)
-    common = fit.with_soil(told, some, common)
-    return fit.outcome(fit.run(prepared, state, everyone, common), known, common)
-
-
-def _received(voltages: Voltages, wavenumber_radpm: FloatArray, knowledge: SiteKnowledge) -> ComplexArray:
-    """(mirror, receiver, transmitter) sum of the rays of mirrors as commanded; NaN where there is none."""
-    shape = (*knowledge.receiver_mirror_m.shape[:2], len(wavenumber_radpm))
-    rays = voltages.rays
-    link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
-    mirror = link // (shape[1] * shape[2])
-    at = knowledge.pivot_enu_m[mirror] + np.einsum("kab,kb->ka", knowledge.commanded_rot[mirror], rays.place_mirror_m)
-    path_m = np.linalg.norm(rays.source_enu_m - at, axis=1) + rays.extra_m
-    out = np.zeros(int(np.prod(shape)), np.complex128)
-    np.add.at(out, link, voltages.voltage * np.exp(-1j * wavenumber_radpm[link % shape[2]] * path_m))
-    return np.where(out == 0.0, np.nan, out).reshape(shape)
 
 
 def _given(settings: SiteSettings) -> Common:

@@ -10,9 +10,19 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.drawing import new_figure
-from rfpose.errors import ScenarioError
-from rfpose.layout.budget import BudgetLine, ErrorBudget, error_budget, make_plan
-from rfpose.pipeline.layout.site import Field, Postures, Site, load_site, postures_of, stacked
+from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.layout.budget import (
+    BudgetLine,
+    ErrorBudget,
+    SiteMirrors,
+    SitePlan,
+    converter_share_of,
+    error_budget,
+    make_plan,
+    site_budget,
+)
+from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, load_site, postures_of, stacked
+from rfpose.pipeline.site import foreseen_mirrors
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
@@ -51,8 +61,8 @@ class SiteBudget(Shown, Tabled):
             "scenario": self.scenario.name,
             "heliostats": len(self.scenario.heliostat),
             "postures": len(self.posture_names),
-            "pose": "rigid" if found.plan.estimator.rigid else "independent",
-            "wavelengths_m": [float(row.mean()) for row in found.plan.waves.wavelength_m],
+            "pose": found.pose,
+            "wavelengths_m": list(found.wavelength_m),
             "draws": found.n_draw,
             "solutions_failed": found.n_failed,
             "sum": {key: whole[key] for key in ("normal_mrad", "target_m", "worst_heliostat_mrad")},
@@ -133,9 +143,9 @@ def budget(
     scenario, field, postures
         As in `layout_map`.
     pose
-        ``rigid``, or ``independent``.
+        ``rigid``, ``independent``, or ``site``: among the rays that the site's geometry lets one foresee.
     ground
-        Replaces ``[budget] ground``.
+        Replaces ``[budget] ground``. Not with pose ``site``, whose ground is that of ``[reflection]``.
     n_draw, seed
         Frames drawn a line, 0 for linear analysis alone; equal seeds give equal results.
 
@@ -154,19 +164,54 @@ def budget(
     site = load_site(scenario, field)
     if ground is not None:
         site = site.changed(budget={"ground": ground})
+    if ground is not None and pose == "site":
+        raise InvalidInputError("pose site has the ground of [reflection]; leave `ground` away, or choose another pose")
     with naming(scenario):
         studied = postures_of(site, postures or Postures())
-        plan = make_plan(site, stacked([p.mirrors for p in studied]), pose=pose)
-    found = error_budget(plan, n_draw=n_draw, seed=seed, aim_enu_m=site.site.aim_enu_m, progress=on_progress)
-    blind = np.flatnonzero(~np.isfinite(found.whole.normal_rad))
-    if blind.size:
-        name = site.heliostat_ids[int(blind[0]) % len(site.heliostat)]
-        with naming(scenario):
-            raise ScenarioError(
-                f"the pose of heliostat `{name}` is not determined by its phases; add transmitters, a calibration "
-                "receiver, or a surveyed pivot"
-            )
+        wanted: dict[str, Any] = {
+            "n_draw": n_draw,
+            "seed": seed,
+            "aim_enu_m": site.site.aim_enu_m,
+            "progress": on_progress,
+        }
+        if pose == "site":
+            found = site_budget(_site_plan(site, studied), **wanted)
+        else:
+            found = error_budget(make_plan(site, stacked([p.mirrors for p in studied]), pose=pose), **wanted)
+        _refuse_blind(site, found, studied)
     return SiteBudget(scenario=site, posture_names=tuple(p.name for p in studied), budget=found)
+
+
+def _site_plan(site: Scenario, studied: list[Posture]) -> SitePlan:
+    """Foresee a field in all its postures."""
+    parts, n = [], len(site.heliostat)
+    for k, posture in enumerate(studied):
+        rot = np.concatenate([posture.mirrors.rot_enu_from_mirror, posture.plate_rot])
+        parts += [SiteMirrors(rows=k * n + column, foreseen=part) for column, part in foreseen_mirrors(site, rot)]
+    mirrors = stacked([p.mirrors for p in studied])
+    return SitePlan(
+        scenario=site,
+        mirrors=mirrors,
+        parts=tuple(parts),
+        converter_share=converter_share_of(site, mirrors.receiver_enu_m),
+    )
+
+
+def _refuse_blind(site: Scenario, found: ErrorBudget, studied: list[Posture]) -> None:
+    blind = np.flatnonzero(~np.isfinite(found.whole.normal_rad))
+    if not blind.size:
+        return
+    posture, heliostat = divmod(int(blind[0]), len(site.heliostat))
+    name = site.heliostat_ids[heliostat]
+    if found.pose == "site":
+        raise ScenarioError(
+            f"heliostat `{name}` receives too little to be solved in posture `{studied[posture].name}`; `rfpose layout "
+            "map --estimator site` says of each mirror why"
+        )
+    raise ScenarioError(
+        f"the pose of heliostat `{name}` is not determined by its phases; add transmitters, a calibration "
+        "receiver, or a surveyed pivot"
+    )
 
 
 def _drawn(found: SiteBudget) -> Figure:

@@ -1,7 +1,7 @@
 """Pose ``site``: mirrors among reflections, by the rays that the site's geometry lets one expect."""
 
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.forecast import SiteForecast, forecast_normals
+from rfpose.pipeline.site.forecast import SiteForecast, forecast_normals, foreseen_mirrors
 from rfpose.pipeline.site.poses import SiteOutcome, check_site_solvable, solve_site_poses
 
 __all__ = [
@@ -11,5 +11,6 @@ __all__ = [
     "antenna_of",
     "check_site_solvable",
     "forecast_normals",
+    "foreseen_mirrors",
     "solve_site_poses",
 ]
