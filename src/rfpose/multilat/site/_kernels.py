@@ -12,7 +12,8 @@ _MAX_STEP_RAD = 0.05
 _SETTLED_SIGMAS = 2e-2
 _SETTLED_WEIGHT = 5e-2
 _ENDED_SIGMAS = 0.2
-"""A fit that reweighting still moves by less than this is taken as it is: weights settle slowly."""
+"""A pose that reweighting still moves by less than this is taken as it is: weights settle slowly, and the phase of a
+transmitter that hardly counts may not settle at all."""
 _MIN_STEPS = 5
 _PATIENT_STEPS = 30
 _FREE = 1e-3
@@ -235,6 +236,77 @@ def add_soil_errors(begin, end, heard, part, h, row_of, share, n, s):
 
 
 @kernel
+def whitened_rows(
+    begin,
+    end,
+    heard,
+    part,
+    h,
+    slope_h,
+    k_tx,
+    row_of,
+    link_at,
+    residual,
+    variance,
+    weight,
+    heavy,
+    share,
+    touched,
+    n,
+    n_clock,
+    s,
+    lower,
+    a,
+):
+    """Phases by pose, transmitters and clocks, residuals last, whitened; false where their covariance is singular.
+
+    ``heavy`` is how much more variance links have than their weights say.
+    """
+    n_tx = len(k_tx)
+    n_par = 6 + n_tx + n_clock
+    s[:n, :n] = 0.0
+    for i in range(n):
+        link = link_at[i]
+        t = link % n_tx
+        a[i, :] = 0.0
+        for q in range(6):
+            a[i, q] = (slope_h[link, q] / h[link]).imag
+        a[i, 6 + t] = 1.0
+        if n_clock:
+            a[i, 6 + n_tx + link // n_tx] = -k_tx[t]
+        a[i, n_par] = residual[i]
+        s[i, i] = heavy * variance[i] / weight[i]
+    add_factor_errors(begin, end, heard, part, h, row_of, share, touched, s)
+    add_soil_errors(begin, end, heard, part, h, row_of, share, n, s)
+    lower[:n, :n] = s[:n, :n]
+    if not cholesky(lower, n):
+        return False
+    forward(lower, n, a, n_par + 1)
+    return True
+
+
+@kernel
+def add_priors(prior, m, pivot, rot, n_tx, n_clock, off, normal, gradient):
+    """Add what is known of a mirror before: posture, mount, pivot, clocks."""
+    turn_between(prior.commanded_rot[m], rot, off)
+    for q in range(3):
+        for p in range(3):
+            normal[q, p] += prior.posture_info[m, q, p]
+            gradient[q, 0] += prior.posture_info[m, q, p] * off[p]
+        normal[3 + q, 3 + q] += prior.pivot_info
+        gradient[3 + q, 0] += prior.pivot_info * (prior.pivot[m, q] - pivot[q])
+    tilt = (rot[1, 0], -rot[0, 0])  # of the x axis out of the horizontal, by a turn about east and north
+    for p in range(2):
+        gradient[p, 0] -= prior.roll_info * tilt[p] * rot[2, 0]
+        for q in range(2):
+            normal[p, q] += prior.roll_info * tilt[p] * tilt[q]
+    for t in range(n_tx):
+        normal[6 + t, 6 + t] += _FREE
+    for r in range(n_clock):
+        normal[6 + n_tx + r, 6 + n_tx + r] += max(prior.clock_info, _FREE)
+
+
+@kernel
 def invert(lower, n, out):
     """Invert a lower triangle; above its diagonal ``out`` keeps what it had."""
     for i in range(n):
@@ -381,6 +453,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
     normal = np.empty((n_par, n_par))
     normal_lower = np.empty((n_par, n_par))
     gradient = np.empty((n_par, 1))
+    cov, last = np.empty((6, 6)), np.empty((6, 1))
     own = np.empty(n_link)
     part_dof = np.empty(n_link)
     seen = np.empty(n_par)
@@ -436,44 +509,16 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                 residual[i] = np.angle(carrier[m, r, t]) - np.angle(h[link])
                 if n_step == 0:
                     beta[t] += complex(np.cos(residual[i]), np.sin(residual[i])) / variance[i]
-            s[:n, :n] = 0.0
             for i in range(n):
-                link = link_at[i]
-                t, r = link % n_tx, link // n_tx
-                a[i, :] = 0.0
-                for q in range(6):
-                    a[i, q] = (slope_h[link, q] / h[link]).imag
-                a[i, 6 + t] = 1.0
-                if n_clock:
-                    a[i, 6 + n_tx + r] = -k_tx[t]
-                residual[i] = wrapped(residual[i] - np.angle(beta[t]))
-                a[i, n_par] = residual[i]
-                s[i, i] = variance[i] / weight[i]
-            add_factor_errors(begin, end, heard, part, h, row_of, share, touched, s)
-            add_soil_errors(begin, end, heard, part, h, row_of, share, n, s)
-            lower[:n, :n] = s[:n, :n]
-            if not cholesky(lower, n):
+                residual[i] = wrapped(residual[i] - np.angle(beta[link_at[i] % n_tx]))
+            if not whitened_rows(
+                begin, end, heard, part, h, slope_h, k_tx, row_of, link_at, residual, variance, weight, 1.0, share,
+                touched, n, n_clock, s, lower, a,
+            ):  # fmt: skip
                 failed = True
                 break
-            forward(lower, n, a, n_par + 1)
             square(a, n, n_par, normal, gradient)
-            # priors: posture, mount, pivot, clocks
-            turn_between(prior.commanded_rot[m], rot, off)
-            for q in range(3):
-                for p in range(3):
-                    normal[q, p] += prior.posture_info[m, q, p]
-                    gradient[q, 0] += prior.posture_info[m, q, p] * off[p]
-                normal[3 + q, 3 + q] += prior.pivot_info
-                gradient[3 + q, 0] += prior.pivot_info * (prior.pivot[m, q] - pivot[q])
-            tilt = (rot[1, 0], -rot[0, 0])  # of the x axis out of the horizontal, by a turn about east and north
-            for p in range(2):
-                gradient[p, 0] -= prior.roll_info * tilt[p] * rot[2, 0]
-                for q in range(2):
-                    normal[p, q] += prior.roll_info * tilt[p] * tilt[q]
-            for t in range(n_tx):
-                normal[6 + t, 6 + t] += _FREE
-            for r in range(n_clock):
-                normal[6 + n_tx + r, 6 + n_tx + r] += max(prior.clock_info, _FREE)
+            add_priors(prior, m, pivot, rot, n_tx, n_clock, off, normal, gradient)
             normal_lower[:] = normal
             if not cholesky(normal_lower, n_par):
                 failed = True
@@ -538,7 +583,8 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                 open_part = max(1.0 - part_dof[i], 0.0) / weight[i]
                 new = (nu + 1.0) / (nu + residual[i] ** 2 / variance[i] + open_part)
                 change = max(change, abs(new - weight[i]))
-                weight[i] = 0.5 * (weight[i] + new)
+                if n_step + 1 < law.max_steps:  # one step alone is a forecast: links count what they do on average
+                    weight[i] = 0.5 * (weight[i] + new)
             if law.own_scale > 0.0 and n_step >= 2:
                 new_scale = (law.own_scale + scale * total) / (law.own_scale + max(dof, 0.0))
                 change = max(change, abs(np.log(new_scale / scale)))
@@ -575,7 +621,17 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
         out.scale[m] = scale
         out.total[m] = scale * total
         out.dof[m] = dof
-        out.steps[m] = n_step if length < _ENDED_SIGMAS**2 else law.max_steps
+        for q in range(6):
+            last[q, 0] = gradient[q, 0]
+        # expected information of Student's t (Lange et al., section 4), of what has that distribution
+        whitened_rows(
+            begin, end, heard, part, h, slope_h, k_tx, row_of, link_at, residual, variance, weight,
+            (nu + 3.0) / (nu + 1.0), share, touched, n, n_clock, s, lower, a,
+        )  # fmt: skip
+        square(a, n, n_par, normal, gradient)
+        add_priors(prior, m, pivot, rot, n_tx, n_clock, off, normal, gradient)
+        normal_lower[:] = normal
+        cholesky(normal_lower, n_par)
         for p in range(6):
             gradient[:, 0] = 0.0
             gradient[p, 0] = 1.0
@@ -587,6 +643,13 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
                 gradient[q, 0] = x / normal_lower[q, q]
             for q in range(6):
                 out.cov[m, q, p] = gradient[q, 0]
+        cov[:] = out.cov[m]
+        cholesky(cov, 6)
+        forward(cov, 6, last, 1)
+        length = 0.0
+        for q in range(6):
+            length += last[q, 0] ** 2
+        out.steps[m] = n_step if length < _ENDED_SIGMAS**2 else law.max_steps
         for i in range(n):
             r, t = link_at[i] // n_tx, link_at[i] % n_tx
             out.weight[m, r, t] = weight[i]

@@ -594,10 +594,8 @@ class _Fit:
 
     def outcome(self, state: _State, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""
-        nu = common.tail
-        cov = state.cov * (nu + 3.0) / (nu + 1.0)  # expected information of Student's t, Lange et al. section 4
         order = [3, 4, 5, 0, 1, 2]
-        cov = cov[:, order][:, :, order]
+        cov = state.cov[:, order][:, :, order]
         status = np.full(len(known), PoseStatus.OK, np.int64)
         poses = SitePoses(
             pivot_enu_m=state.pivot, rot_enu_from_mirror=state.rot, cov=cov, weight=state.weight,
