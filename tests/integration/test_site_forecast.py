@@ -8,11 +8,12 @@ import pytest
 import rfpose as rf
 from rfpose import geometry
 from rfpose.dsp import TonePhases
+from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.site import Common
+from rfpose.multilat.site import Common, Disturbance
 from rfpose.pipeline.layout import layout_map
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.site import SiteField, antenna_of
+from rfpose.pipeline.site import SiteField, antenna_of, foreseen_mirrors
 from rfpose.pipeline.solve import solve
 from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
@@ -126,3 +127,65 @@ def test_mirrors_learn_the_ground_together() -> None:
     alone = many.changed(heliostat=many.heliostat[:1])
     sigma = [layout_map(s, estimators=["site"]).rms_mrad["site"][0] for s in (many, alone)]
     assert 0.9 < sigma[0] / sigma[1] < 0.97
+
+
+RECKONED = {
+    "thermal noise", "what nothing foresees", "the ground's permittivity", "roughness of the ground",
+    "reflections of neighbours and tower", "diffraction at edges", "pivot survey", "commanded posture", "mount",
+    "clock",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("ground", "plate", "snr_db", "floor"), [CASES[0], CASES[3], CASES[4]])
+def test_the_budgets_lines_add_up_to_the_forecast(ground: bool, plate: bool, snr_db: float, floor: float) -> None:
+    scenario = site(ground=ground, plate=plate, snr_db=snr_db, floor=floor)
+    lines = {line["source"]: line for line in rf.budget(scenario, pose="site", n_draw=0).as_dict()["lines"]}
+    whole = np.sqrt(np.mean(layout_map(scenario, estimators=["site"]).rms_mrad["site"] ** 2))
+    reckoned = [line["normal_mrad"] ** 2 for name, line in lines.items() if name in RECKONED]
+    assert np.sqrt(sum(reckoned)) == pytest.approx(whole, rel=1e-3)
+    assert ("the ground's permittivity" in lines) == ground
+    assert ("reflections of neighbours and tower" in lines) == plate
+    assert lines["receiver plane to glass"]["normal_mrad"] == pytest.approx(0.5 * np.sqrt(2.0))
+
+
+def test_the_budget_is_what_draws_through_the_fit_show() -> None:
+    found = rf.budget(site(ground=True, plate=True), pose="site", n_draw=40).as_dict()
+    assert found["solutions_failed"] == 0
+    lines = {line["source"]: line for line in found["lines"]}
+    for name in ("what nothing foresees", "receiver places", "receiver plane to glass", "clock"):
+        # 12 mirrors, 40 draws, two angles each
+        ratio = lines[name]["monte_carlo_mrad"] / lines[name]["normal_mrad"]
+        assert ratio == pytest.approx(1.0, abs=0.1), name
+    # of some forty phases, 24 are left to tell stray fields by: their tails cost more than with many
+    assert found["sum"]["normal_mrad"] / found["monte_carlo"]["normal_mrad"] == pytest.approx(0.95, abs=0.06)
+
+
+def test_receivers_that_are_turned_turn_the_normal() -> None:
+    """What a turn of the receivers against the plate does is exactly known: the pose turns back."""
+    scenario = site(ground=False, plate=False, floor=1e-5)
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
+    ((_, foreseen),) = foreseen_mirrors(scenario, rot)
+    turn = np.array([3e-5, -2e-5, 1e-5])
+    place = np.cross(turn, foreseen.knowledge.receiver_mirror_m)
+    found = foreseen.normal_change(Disturbance(place_m=place), linear=True)
+    expected = np.einsum("mab,b->ma", rot[:N_MIRROR], np.cross(turn, [0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.linalg.norm(turn))
+
+
+def test_a_shift_of_all_transmitters_turns_mirrors_only_where_pivots_are_held() -> None:
+    """All transmitters moved are all mirrors moved the other way: exact where nothing is known of pivots."""
+    scenario = site(ground=False, plate=False, floor=1e-5)
+    free = scenario.changed(heliostat=[{**h.model_dump(), "pivot_sigma_m": 10.0} for h in scenario.heliostat])
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
+    shift = np.tile([1e-4, -2e-4, 1e-4], (len(scenario.transmitter), 1))
+    change = {}
+    for name, told in (("held", scenario), ("free", free)):
+        ((_, foreseen),) = foreseen_mirrors(told, rot)
+        change[name] = np.abs(foreseen.normal_change(Disturbance(transmitter_m=shift), linear=True)).max()
+    assert change["free"] < 1e-8
+    assert change["held"] > 20.0 * change["free"]
+
+
+def test_a_budget_of_pose_site_refuses_what_it_does_not_have() -> None:
+    with pytest.raises(InvalidInputError, match=r"\[reflection\]"):
+        rf.budget(site(ground=True, plate=False), pose="site", ground="known")
