@@ -189,3 +189,20 @@ def test_a_shift_of_all_transmitters_turns_mirrors_only_where_pivots_are_held() 
 def test_a_budget_of_pose_site_refuses_what_it_does_not_have() -> None:
     with pytest.raises(InvalidInputError, match=r"\[reflection\]"):
         rf.budget(site(ground=True, plate=False), pose="site", ground="known")
+
+
+def test_moved_transmitters_are_received_as_if_foreseen_anew() -> None:
+    scenario = site(ground=True, plate=False)
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
+    shift = 1e-3 * np.random.default_rng(2).normal(size=(len(scenario.transmitter), 3))
+    moved = scenario.changed(
+        transmitter=[
+            {**t.model_dump(exclude_none=True), "position_enu_m": tuple(np.asarray(t.position_enu_m) + d)}
+            for t, d in zip(scenario.transmitter, shift, strict=True)
+        ]
+    )
+    ((_, before),), ((_, after),) = foreseen_mirrors(scenario, rot), foreseen_mirrors(moved, rot)
+    ratio = before.received(Disturbance(transmitter_m=shift)) / after.received()
+    change = before.received() / after.received()
+    assert np.abs(change - 1.0).max() > 5e-3
+    assert np.abs(ratio - 1.0).max() < 2e-4
