@@ -13,7 +13,7 @@ from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import Common, Disturbance
 from rfpose.pipeline.layout import layout_map
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.site import SiteField, antenna_of, foreseen_mirrors
+from rfpose.pipeline.site import SiteField, antenna_of, foreseen_mirrors, stray_ranges
 from rfpose.pipeline.solve import solve
 from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
@@ -206,3 +206,59 @@ def test_moved_transmitters_are_received_as_if_foreseen_anew() -> None:
     change = before.received() / after.received()
     assert np.abs(change - 1.0).max() > 5e-3
     assert np.abs(ratio - 1.0).max() < 2e-4
+
+
+def test_a_wall_shifts_ranges_as_its_image_says() -> None:
+    """A metal wall that reaches everywhere turns vertical waves as a second transmitter behind it, upside down."""
+    rng = np.random.default_rng(5)
+    table2 = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    wall_m = 8.0
+    transmitter = [
+        {**t.model_dump(exclude_none=True), "position_enu_m": (-20.0 - 8.0 * i, *rng.uniform([-30, 5], [30, 20]))}
+        for i, t in enumerate(table2.transmitter)
+    ]
+    scenario = table2.changed(
+        heliostat=[
+            {**h.model_dump(exclude_none=True), "pivot_enu_m": (0.0, 6.0 * i, 4.0), "normal_enu": (0.0, 0.0, 1.0)}
+            for i, h in enumerate(table2.heliostat[:3])
+        ],
+        transmitter=transmitter,
+        calibration_receiver=[{"id": "cal", "position_enu_m": (-3.0, 2.0, 5.0)}],
+        site={"structures": {"plate": [
+            {"id": "wall", "pivot_enu_m": (wall_m, 0.0, 0.0), "width_m": 500.0, "height_m": 500.0,
+             "normal_enu": (-1.0, 0.0, 0.0)}
+        ]}},
+        radio={"centre_frequency_hz": 433e6},
+        multipath={"foresee": ("specular",), "reach_m": 1000.0},
+    )  # fmt: skip
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
+    tone_hz = np.array([750e3, 7.5e6, 0.0])
+    mirrors, calibration = stray_ranges(scenario, rot, tone_hz)
+    at = np.array([h.pivot_enu_m for h in scenario.heliostat])[:, None] + np.einsum(
+        "mab,mrb->mra", rot[:3], np.array([h.receiver_mirror_m for h in scenario.heliostat])
+    )
+    for found, place in ((mirrors, at), (calibration[:, :, None], scenario.calibration_enu_m[:, None])):
+        way = np.linalg.norm(scenario.transmitter_enu_m - place[:, :, None], axis=-1)
+        image = scenario.transmitter_enu_m * [-1.0, 1.0, 1.0] + [2.0 * wall_m, 0.0, 0.0]
+        detour = np.linalg.norm(image - place[:, :, None], axis=-1)
+        k = 2.0 * np.pi * scenario.carrier_rf_hz / scenario.radio.propagation_speed_mps
+
+        def line(hz: float, way: np.ndarray = way, detour: np.ndarray = detour, k: np.ndarray = k) -> np.ndarray:
+            q = k + 2.0 * np.pi * hz / scenario.radio.propagation_speed_mps
+            return np.asarray(1.0 / way - np.exp(-1j * q * (detour - way)) / detour)
+
+        np.testing.assert_allclose(found[:, 2], -np.angle(line(0.0)) / k, atol=1e-4)
+        for group, hz in enumerate(tone_hz[:2]):
+            kappa = 2.0 * np.pi * hz / scenario.radio.propagation_speed_mps
+            beat = line(hz) * line(0.0).conj() + line(-hz).conj() * line(0.0)
+            np.testing.assert_allclose(found[:, group], -np.angle(beat) / kappa, atol=1e-3)
+
+
+def test_what_a_wall_does_is_in_the_budget_of_straight_rays() -> None:
+    plain, walled = site(ground=False, plate=False), site(ground=False, plate=True)
+    told = {name: rf.budget(s, n_draw=10).as_dict() for name, s in (("plain", plain), ("walled", walled))}
+    names = {name: [line["source"] for line in found["lines"]] for name, found in told.items()}
+    assert "reflections of the site" not in names["plain"]
+    line = next(x for x in told["walled"]["lines"] if x["source"] == "reflections of the site")
+    assert line["monte_carlo_mrad"] == pytest.approx(line["normal_mrad"], rel=0.05)
+    assert "--pose site" in line["remedy"]

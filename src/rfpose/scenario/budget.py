@@ -28,8 +28,8 @@ class Budget(Record):
     ground_coefficient_sigma: NonNegative = 0.02
     """Of real and imaginary part, where the coefficient is known."""
     ground_height_sigma_m: NonNegative = 0.005
-    multipath_db: Annotated[float, Field(lt=0)] | None = -60.0
-    """Strength of one stray ray a receiver and transmitter against the direct one."""
+    multipath_db: Annotated[float, Field(lt=0)] | None = None
+    """Strength of one more stray ray a receiver and transmitter against the direct one, which nothing foresees."""
     multipath_excess_m: Positive = 10.0
     """Mean of its exponentially distributed detour."""
     mirror_rate_mrad_per_s: NonNegative = 0.0365

@@ -58,6 +58,10 @@ class Plan:
         Slope of each range by the receiver's and by the transmitter's place.
     calibration_by_place, calibration_by_transmitter : (calibration receiver, tone, transmitter, xyz)
         The same at the calibration receivers.
+    stray_m : (mirror, group, receiver, transmitter), optional
+        What reflections of neighbours, tower and own plate add to ranges [m]; None: nothing is known of them.
+    calibration_stray_m : (calibration receiver, tone, transmitter), optional
+        The same at the calibration receivers [m].
     """
 
     scenario: Scenario
@@ -72,6 +76,8 @@ class Plan:
     by_transmitter: FloatArray
     calibration_by_place: FloatArray
     calibration_by_transmitter: FloatArray
+    stray_m: FloatArray | None = None
+    calibration_stray_m: FloatArray | None = None
 
     @property
     def sigma_m(self) -> FloatArray:

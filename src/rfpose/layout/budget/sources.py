@@ -352,6 +352,33 @@ class GroundReflection:
             world.coefficient += re + 1j * im
 
 
+class Reflections:
+    """Rays off neighbours, the tower and the mirror's own plate, foreseen from their geometry."""
+
+    name = "reflections of the site"
+    remedy = "`rfpose process --pose site`, which has them in its model (`rfpose layout budget --pose site`)"
+
+    def assumed(self, plan: Plan) -> str:
+        return "" if plan.stray_m is None else "rays foreseen from outlines and [site.structures]"
+
+    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+        assert plan.stray_m is not None
+        assert plan.calibration_stray_m is not None
+        shift = plan.stray_m.copy()
+        if _calibrated(plan):
+            shift[:, : plan.waves.n_tone] -= np.einsum(
+                "cgt,cgt->gt", plan.calibration_stray_m, plan.calibration_weight
+            )[:, None]
+        return [Effect(np.einsum("magrt,mgrt->ma", by_range, shift)[..., None], common=True)]
+
+    def disturb(self, world: World) -> None:
+        plan = world.plan
+        assert plan.stray_m is not None
+        assert plan.calibration_stray_m is not None
+        world.range_m += plan.stray_m
+        world.calibration_m += plan.calibration_stray_m
+
+
 class Multipath:
     """One stray ray for every receiver and transmitter, of random phase and detour."""
 
@@ -497,6 +524,7 @@ SOURCES: tuple[Source, ...] = (
     Misalignment(),
     Pivot(),
     GroundReflection(),
+    Reflections(),
     Multipath(),
     Motion(),
     Wavelength(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.layout.budget import (
     BudgetLine,
     ErrorBudget,
+    Plan,
     SiteMirrors,
     SitePlan,
     converter_share_of,
@@ -22,7 +23,7 @@ from rfpose.layout.budget import (
     site_budget,
 )
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, load_site, postures_of, stacked
-from rfpose.pipeline.site import foreseen_mirrors
+from rfpose.pipeline.site import foreseen_mirrors, stray_ranges
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
@@ -177,9 +178,25 @@ def budget(
         if pose == "site":
             found = site_budget(_site_plan(site, studied), **wanted)
         else:
-            found = error_budget(make_plan(site, stacked([p.mirrors for p in studied]), pose=pose), **wanted)
+            found = error_budget(_plan(site, studied, pose), **wanted)
         _refuse_blind(site, found, studied)
     return SiteBudget(scenario=site, posture_names=tuple(p.name for p in studied), budget=found)
+
+
+def _plan(site: Scenario, studied: list[Posture], pose: str) -> Plan:
+    """Return the working point of an estimator that knows straight rays, with what other rays do to it."""
+    plan = make_plan(site, stacked([p.mirrors for p in studied]), pose=pose)
+    shaped = site.site.structures.box or any(m.width_m is not None for m in site.mirrors)
+    if not (shaped and site.has_rf_carriers):
+        return plan
+    shifts = [
+        stray_ranges(site, np.concatenate([p.mirrors.rot_enu_from_mirror, p.plate_rot]), plan.waves.tone_hz)
+        for p in studied
+    ]
+    mirrors = np.concatenate([mirror for mirror, _ in shifts])
+    # calibration receivers are the same for all rows: of several postures they have the mean
+    calibration = np.mean([there for _, there in shifts], axis=0)[:, : plan.waves.n_tone]
+    return replace(plan, stray_m=mirrors, calibration_stray_m=calibration)
 
 
 def _site_plan(site: Scenario, studied: list[Posture]) -> SitePlan:

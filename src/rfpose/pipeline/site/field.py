@@ -19,7 +19,7 @@ from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, fores
 from rfpose.propagation.site import place_things
 from rfpose.scenario import Scenario
 
-__all__ = ["ReceivingAntenna", "SiteField", "antenna_of"]
+__all__ = ["ReceivingAntenna", "SiteField", "VerticalAntenna", "antenna_of", "foresight_of"]
 
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
@@ -175,6 +175,22 @@ def antenna_of(scenario: Scenario) -> ReceivingAntenna:
     return VerticalAntenna()
 
 
+def foresight_of(scenario: Scenario, *, own_plate: bool) -> Foresight:
+    """Return which rays a scenario wants foreseen, those off the mirror's own plate only if they are asked for."""
+    table = scenario.multipath
+    return Foresight(
+        visibility=table.visibility,
+        ground="ground" in table.foresee,
+        specular="specular" in table.foresee,
+        diffracted=table.edges if "diffracted" in table.foresee else "none",
+        wedge=table.wedge,
+        own_plate=own_plate and "own_plate" in table.foresee,
+        reach_m=table.reach_m,
+        antenna=scenario.antenna.transmitter,
+        propagation_speed_mps=scenario.radio.propagation_speed_mps,
+    )
+
+
 class SiteField:
     """Rays and voltages of a group of mirrors, all frames, for `rfpose.multilat.site.fit_site`."""
 
@@ -184,18 +200,7 @@ class SiteField:
         """Take the orientations that were commanded (frame, mirror, 3, 3), mirrors as `Scenario.mirrors` has them."""
         self._scenario, self._group, self._antenna = scenario, group, antenna
         self._commanded = commanded_rot
-        table = scenario.multipath
-        self._options = Foresight(
-            visibility=table.visibility,
-            ground="ground" in table.foresee,
-            specular="specular" in table.foresee,
-            diffracted=table.edges if "diffracted" in table.foresee else "none",
-            wedge=table.wedge,
-            own_plate="own_plate" in table.foresee and not antenna.holds_own_plate,
-            reach_m=table.reach_m,
-            antenna=scenario.antenna.transmitter,
-            propagation_speed_mps=scenario.radio.propagation_speed_mps,
-        )
+        self._options = foresight_of(scenario, own_plate=not antenna.holds_own_plate)
 
     def __call__(self, pivot_enu_m: FloatArray, rot: FloatArray, common: Common) -> Voltages:
         """Return what the mirrors would receive; the first axis is frame × heliostat of the group."""
