@@ -11,7 +11,7 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import Common, Disturbance
-from rfpose.pipeline.layout import layout_map
+from rfpose.pipeline.layout import Rules, layout_map
 from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.site import SiteField, antenna_of, foreseen_mirrors, stray_ranges
 from rfpose.pipeline.solve import solve
@@ -262,3 +262,20 @@ def test_what_a_wall_does_is_in_the_budget_of_straight_rays() -> None:
     line = next(x for x in told["walled"]["lines"] if x["source"] == "reflections of the site")
     assert line["monte_carlo_mrad"] == pytest.approx(line["normal_mrad"], rel=0.05)
     assert "--pose site" in line["remedy"]
+
+
+def test_transmitters_placed_for_pose_site_are_what_its_map_says() -> None:
+    many = site(ground=False, plate=True)
+    few = many.changed(heliostat=many.heliostat[:3])
+    found = rf.optimise(few, criterion="site", starts=2, rules=Rules(keep=8))
+    before, after = (
+        np.sqrt(np.mean(layout_map(s, estimators=["site"]).rms_mrad["site"] ** 2)) for s in (few, found.scenario)
+    )
+    told = found.as_dict()
+    assert told["criterion"] == "site"
+    assert told["unit"] == "mrad"
+    assert told["before"] == pytest.approx(before, rel=1e-9)
+    assert told["value"] == pytest.approx(after, rel=1e-9)
+    assert told["value"] < told["before"]
+    assert told["without_worst"] > told["value"]
+    np.testing.assert_array_equal(found.scenario.transmitter_enu_m[:8], few.transmitter_enu_m[:8])

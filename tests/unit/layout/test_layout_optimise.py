@@ -5,7 +5,16 @@ import pytest
 
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout.maps import check_site, disc_points, mirrors_facing
-from rfpose.layout.optimise import Constraints, Costs, Zone, evaluate_placement, optimise, pareto
+from rfpose.layout.optimise import (
+    Constraints,
+    Costs,
+    Zone,
+    efficient,
+    evaluate_placement,
+    exchange,
+    measured,
+    optimise,
+)
 
 TRIANGLE = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
 FIELD = mirrors_facing(disc_points(100), TRIANGLE, normal_enu=[0.0, -0.5, 1.0])
@@ -69,7 +78,7 @@ def test_costs_count_new_towers_height_and_cable():
 
 
 def test_more_transmitters_are_dearer_and_better():
-    found = pareto([5, 6, 8], FIELD, DISC, costs=Costs(per_tower=2.0), starts=2)
+    found = efficient([optimise(n, FIELD, DISC, costs=Costs(per_tower=2.0), starts=2) for n in (5, 6, 8)])
     value = [placement.value for placement, _ in found]
     assert value == sorted(value, reverse=True)
     assert [placement.cost for placement, _ in found] == [10.0, 12.0, 16.0]
@@ -122,3 +131,49 @@ def test_broken_guidelines_are_named():
         check_site(np.outer(np.arange(6.0), [1.0, 2.0, 0.5]))
     with pytest.raises(GeometryError, match="same place"):
         check_site(np.vstack([ring, ring[2]]) + np.outer(np.arange(7) == 1, [0.0, 0.0, 1.0]))
+
+
+def well_off(site):
+    """Variance at two points: how far the nearest tower is from each, one of them seen from the east only."""
+    wanted = np.array([[0.6, 0.2], [-0.5, -0.5]])
+    far = np.linalg.norm(site[:, None, :2] - wanted, axis=2)
+    far[:, 0] = np.where(site[:, 0] > 0.0, far[:, 0], 10.0)  # a jump: no slope leads there
+    return 0.01 + far.min(axis=0) ** 2
+
+
+def test_exchange_follows_a_measure_that_has_no_slope_and_keeps_the_rules():
+    rules = Constraints(
+        allowed=DISC.allowed, height_m=DISC.height_m, separation_m=0.3,
+        excluded=(Zone(centre_enu_m=(0.6, 0.2), radius_m=0.1),),
+    )  # fmt: skip
+    begin = optimise(6, FIELD, rules, starts=1, existing_enu_m=[[0.0, 0.0, 0.4]])
+    calls = []
+    found = exchange(
+        begin, well_off, FIELD, rules, criterion="near", tries=60, seed=3, progress=lambda k, n: calls.append((k, n))
+    )
+    assert found.criterion == "near"
+    # 0.1 from the first place, which no tower may come nearer to; at the second
+    least = np.sqrt(0.01 + 0.5 * 0.1**2)
+    assert least <= found.value < 1.15 * least
+    assert found.value == measured(well_off, found.transmitter_enu_m, "rms")
+    assert found.value < measured(well_off, begin.transmitter_enu_m, "rms")
+    np.testing.assert_array_equal(found.transmitter_enu_m[0], begin.transmitter_enu_m[0])
+    ground = found.transmitter_enu_m[:, :2]
+    apart = np.linalg.norm(ground[:, None] - ground, axis=2) + np.eye(6)
+    assert apart.min() >= 0.3 - 1e-6
+    assert np.linalg.norm(ground - [0.6, 0.2], axis=1).min() >= 0.1
+    assert found.lost_one > found.value
+    assert calls[-1] == (25, 25)
+    again = exchange(begin, well_off, FIELD, rules, criterion="near", tries=60, seed=3)
+    np.testing.assert_array_equal(found.transmitter_enu_m, again.transmitter_enu_m)
+
+
+def test_exchange_begins_with_the_best_that_meets_the_rules():
+    begin = optimise(6, FIELD, DISC, starts=1)
+    good, bad = begin.transmitter_enu_m.copy(), begin.transmitter_enu_m.copy()
+    good[0, :2], bad[0, :2] = [0.6, 0.2], [5.0, 0.0]
+    found = exchange(begin, well_off, FIELD, DISC, criterion="near", tries=2, also_from=[good, bad])
+    assert len(found.start_value) == 2
+    assert found.start_value[1] == measured(well_off, good, "rms")
+    with pytest.raises(InvalidInputError, match="tries"):
+        exchange(begin, well_off, FIELD, DISC, criterion="near", tries=1)

@@ -20,7 +20,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 # names only, since the modules that define them load numpy
 ESTIMATORS = ("scenario", "independent", "rigid", "shared-clock", "carrier", "delays", "pivot", "reflection", "site")
-CRITERIA = ("pdop", "independent", "rigid", "shared-clock")
+CRITERIA = ("pdop", "independent", "rigid", "shared-clock", "site")
 
 
 def field_options(function: F) -> F:

@@ -57,6 +57,7 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
     epilog=examples(
         "rfpose layout optimise site.toml -o better.toml",
         "rfpose layout optimise site.toml -o better.toml -n 8 --minimise rigid --statistic p95 --height 15 40",
+        "rfpose layout optimise site.toml -o better.toml --minimise site --day 2026-06-21 --starts 10",
         "rfpose layout optimise site.toml --pareto 6..12 --cost 10000 200 30 --csv curve.csv --picture curve.png",
     ),
 )
@@ -66,7 +67,8 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("--pareto", type=_Counts(), metavar="N1..N2", help="Instead, the best of each number: cost and accuracy.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="With --pareto: one row a number.")
 @click.option("--picture", type=click.Path(path_type=Path), help="With --pareto: PNG or SVG.")
-@click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True)
+@click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True,
+              help="PDOP, or the normal's bound; `site`: what pose `site` states among reflections.")  # fmt: skip
 @click.option("--statistic", default="rms", show_default=True, help="rms, worst, or a percentile such as p95.")
 @click.option("--radius", "radius_m", type=float, help="Farthest from the origin [m]; default: as now.")
 @click.option(
@@ -88,7 +90,8 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("--keep", type=click.IntRange(min=0), default=0, show_default=True, help="The first so many stay.")
 @click.option("--cost", type=(float, float, float), default=(1.0, 0.0, 0.0), metavar="TOWER HEIGHT CABLE",
               help="Cost of a tower, of a metre of height, of a metre of cable.")  # fmt: skip
-@click.option("--starts", type=click.IntRange(min=1), default=30, show_default=True)
+@click.option("--starts", type=click.IntRange(min=1), default=30, show_default=True,
+              help="Random starts; with `--minimise site`, places tried for each tower in each round.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 @field_options
 @force_option

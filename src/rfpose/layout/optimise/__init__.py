@@ -1,14 +1,15 @@
 """Where to put transmitters: what is allowed, what it costs, and the search."""
 
+from rfpose.layout.optimise.exchange import Measure, exchange, measured
 from rfpose.layout.optimise.rules import Constraints, Costs, Zone
 from rfpose.layout.optimise.search import (
     CRITERIA,
     Criterion,
     Placement,
     Progress,
+    efficient,
     evaluate_placement,
     optimise,
-    pareto,
 )
 
 __all__ = [
@@ -16,10 +17,13 @@ __all__ = [
     "Constraints",
     "Costs",
     "Criterion",
+    "Measure",
     "Placement",
     "Progress",
     "Zone",
+    "efficient",
     "evaluate_placement",
+    "exchange",
+    "measured",
     "optimise",
-    "pareto",
 ]

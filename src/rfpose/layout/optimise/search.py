@@ -20,7 +20,7 @@ from rfpose.layout.maps import Mirrors, _field, _plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
 
-__all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "evaluate_placement", "optimise", "pareto"]
+__all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "efficient", "evaluate_placement", "optimise"]
 
 Criterion = Literal["pdop", "independent", "rigid", "shared-clock"]
 CRITERIA: dict[str, int] = {
@@ -67,7 +67,7 @@ class Placement:
 
     transmitter_enu_m: FloatArray
     n_existing: int
-    criterion: Criterion
+    criterion: str
     statistic: str
     value: float
     lost_one: float
@@ -283,12 +283,7 @@ def optimise(
         raise GeometryError(f"{len(existing)} transmitters exist already; `n_transmitter` must be larger")
     if starts < 1:
         raise InvalidInputError(f"`starts` must be at least one, got {starts}")
-    ground = field.pivot_enu_m[:, :2]
-    problem = _Problem(
-        field, criterion, statistic, as_positive("sigma_m", sigma_m), existing, constraints,
-        scale=max(float(np.ptp(np.vstack([z for zone in constraints.allowed for z in zone.box]), axis=0).max()), 1e-9),
-        heliostats=KDTree(ground) if constraints.clearance_m > 0.0 else None,
-    )  # fmt: skip
+    problem = _problem(field, criterion, statistic, as_positive("sigma_m", sigma_m), existing, constraints)
     rng = np.random.default_rng(seed)
     begin = [as_float_array("also_from", x, (n_new, 3)) for x in also_from]
     begin += [_draw(problem, n_new, rng) for _ in range(starts)]
@@ -319,6 +314,17 @@ def optimise(
         cost=(costs or Costs()).of(site, len(existing)),
         start_value=read_only(value),
     )
+
+
+def _problem(
+    field: Mirrors, criterion: Criterion, statistic: str, sigma_m: float, existing: FloatArray, constraints: Constraints
+) -> _Problem:
+    corners = np.vstack([corner for zone in constraints.allowed for corner in zone.box])
+    return _Problem(
+        field, criterion, statistic, sigma_m, existing, constraints,
+        scale=max(float(np.ptp(corners, axis=0).max()), 1e-9),
+        heliostats=KDTree(field.pivot_enu_m[:, :2]) if constraints.clearance_m > 0.0 else None,
+    )  # fmt: skip
 
 
 def _check(criterion: str, statistic: str) -> None:
@@ -409,29 +415,8 @@ def _without_worst(problem: _Problem, site: FloatArray) -> float:
     )
 
 
-def pareto(
-    counts: Sequence[int],
-    field: Mirrors,
-    constraints: Constraints,
-    *,
-    costs: Costs | None = None,
-    progress: Progress | None = None,
-    **settings: Any,
-) -> list[tuple[Placement, bool]]:
-    """Optimise for several numbers of transmitters; True marks those that none beats in cost, value and loss of one.
-
-    Parameters
-    ----------
-    counts
-        Numbers of transmitters.
-    field, constraints, costs, progress, **settings
-        As in `optimise`.
-    """
-    found = []
-    for k, n in enumerate(counts):
-        found.append(optimise(n, field, constraints, costs=costs, **settings))
-        if progress is not None:
-            progress(k + 1, len(counts))
+def efficient(found: Sequence[Placement]) -> list[tuple[Placement, bool]]:
+    """Mark the placements that none beats in cost, value and loss of one."""
     merit = np.array([(p.cost, p.value, np.nan_to_num(p.lost_one, nan=np.inf)) for p in found])
     beaten = [
         any(np.all(other <= own) and np.any(other < own) for k, other in enumerate(merit) if k != i)

@@ -55,7 +55,7 @@ IntArray = npt.NDArray[np.int64]
 
 _MAX_STEPS = 100
 _FIRST_FLOOR = 0.05
-_TAILS = (1.5, 2.0, 3.0, 8.0, 30.0)
+_TAILS = (1.5, 2.0, 3.0, 8.0, 30.0, 300.0)
 _FIRST_TAIL = 3.0
 _LEARN_ROUNDS = 15
 _LEARN_SETTLED = 0.03
@@ -194,7 +194,7 @@ class SiteSettings:
         Residuals do not make it smaller than this.
     tail
         Degrees of freedom ν of Student's t: the smaller, the less a link counts that is far off. None: the one of
-        1.5, 2, 3, 8 and 30 that makes the residuals likeliest.
+        1.5, 2, 3, 8, 30 and 300 that makes the residuals likeliest.
     own_scale
         How many degrees of freedom the mirrors' common floor counts against each mirror's own residuals; infinity: all
         mirrors alike.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
@@ -24,7 +24,9 @@ from rfpose.layout.optimise import (
     evaluate_placement,
 )
 from rfpose.measurement import noise_of
-from rfpose.pipeline.layout.site import Field, Postures, Site, Sun, load_site, postures_of, stacked
+from rfpose.multilat.normal import MAX_SIGMA_RAD
+from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.site import check_site_solvable, forecast_normals
 from rfpose.scenario import Scenario, naming, read_positions
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
@@ -34,6 +36,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Rules", "SitePlacement", "SitePlacements", "optimise", "pareto"]
 
+SITE = "site"
+SiteCriterion = Criterion | Literal["site"]
+"""What may be minimised."""
+
+_STARTS_BEFORE_EXCHANGE = 5
 _SEPARATION = 0.05
 """Towers keep this share of the radius from each other, unless told otherwise."""
 
@@ -199,31 +206,98 @@ class _Task:
     """A scenario made ready for placement."""
 
     scenario: Scenario
+    postures: tuple[Posture, ...]
     field: Mirrors
     constraints: Constraints
-    sigma_m: float
+    keep: int
+    criterion: str
+    statistic: str
+    costs: Costs | None
+    starts: int
+    seed: int
+
+    @property
+    def sigma_m(self) -> float:
+        """Range noise [m]; 1: dilution is wanted."""
+        return 1.0 if self.criterion in ("pdop", SITE) else _sigma_m(self.scenario)
+
+    def place(self, n_transmitter: int, on_progress: Callable[[int, int], None] | None) -> Placement:
+        """Place so many transmitters."""
+        now = self.scenario.transmitter_enu_m
+        by_slope = self.criterion != SITE
+        found = search.optimise(
+            n_transmitter,
+            self.field,
+            self.constraints,
+            criterion=cast(Criterion, self.criterion) if by_slope else "shared-clock",
+            statistic=self.statistic,
+            existing_enu_m=now[: self.keep] if self.keep else None,
+            costs=self.costs,
+            sigma_m=self.sigma_m,
+            starts=self.starts if by_slope else min(self.starts, _STARTS_BEFORE_EXCHANGE),
+            seed=self.seed,
+            progress=on_progress if by_slope else None,
+        )
+        if by_slope:
+            return found
+        return search.exchange(
+            found, self.site_variance, self.field, self.constraints, criterion=SITE, costs=self.costs,
+            tries=max(self.starts, 2), seed=self.seed, also_from=[now] if n_transmitter == len(now) else [],
+            progress=on_progress,
+        )  # fmt: skip
+
+    def value(self, transmitter_enu_m: FloatArray) -> float:
+        """Return what the criterion says of transmitters."""
+        if self.criterion == SITE:
+            return search.measured(self.site_variance, transmitter_enu_m, self.statistic)
+        return evaluate_placement(
+            transmitter_enu_m, self.field, criterion=cast(Criterion, self.criterion), statistic=self.statistic,
+            sigma_m=self.sigma_m,
+        )  # fmt: skip
+
+    def site_variance(self, transmitter_enu_m: FloatArray) -> FloatArray:
+        """(posture × heliostat,) what pose ``site`` would state [rad²]; of a mirror it cannot solve, the most."""
+        moved = self.scenario.with_transmitters(transmitter_enu_m, keep=self.keep)
+        sigma = [
+            forecast_normals(moved, np.concatenate([p.mirrors.rot_enu_from_mirror, p.plate_rot])).sigma_rad
+            for p in self.postures
+        ]
+        return np.nan_to_num(np.concatenate(sigma), nan=MAX_SIGMA_RAD) ** 2
 
 
-def _task(site: Site, field: Field, rules: Rules, criterion: Criterion, postures: Postures) -> _Task:
+def _task(
+    site: Site,
+    field: Field,
+    rules: Rules | None,
+    postures: Postures,
+    *,
+    criterion: str,
+    statistic: str,
+    costs: Costs | None,
+    starts: int,
+    seed: int,
+) -> _Task:
+    chosen = rules or Rules()
     scenario = load_site(site, field)
     now = scenario.transmitter_enu_m
     with naming(site):
-        if not 0 <= rules.keep <= len(now):
-            raise ScenarioError(f"cannot keep {rules.keep} transmitters, the scenario has {len(now)}")
-        studied = stacked([p.mirrors for p in postures_of(scenario, postures)])
+        if not 0 <= chosen.keep <= len(now):
+            raise ScenarioError(f"cannot keep {chosen.keep} transmitters, the scenario has {len(now)}")
+        studied = tuple(postures_of(scenario, postures))
+        if criterion == SITE:
+            check_site_solvable(scenario)
     return _Task(
-        scenario=scenario,
-        field=studied,
-        constraints=rules.constraints(now),
-        sigma_m=1.0 if criterion == "pdop" else _sigma_m(scenario),
-    )
+        scenario=scenario, postures=studied, field=stacked([p.mirrors for p in studied]),
+        constraints=chosen.constraints(now), keep=chosen.keep, criterion=criterion, statistic=statistic, costs=costs,
+        starts=starts, seed=seed,
+    )  # fmt: skip
 
 
 def optimise(
     scenario: Site,
     *,
     n_transmitter: int | None = None,
-    criterion: Criterion = "pdop",
+    criterion: SiteCriterion = "pdop",
     statistic: str = "rms",
     rules: Rules | None = None,
     costs: Costs | None = None,
@@ -242,8 +316,14 @@ def optimise(
         As in `layout_map`.
     n_transmitter
         As many as the scenario has, by default.
+    criterion
+        One of `rfpose.layout.optimise.CRITERIA`; or ``site``: what pose ``site`` would state among the site's
+        reflections. That has no slope: towers are exchanged one after the other (`rfpose.layout.optimise.exchange`),
+        from where they stand or from the best for ``shared-clock``, whichever is better.
     rules
         Where they may stand.
+    starts
+        Random starts; with ``site``, places tried for each tower in each round.
     suns_deg, postures
         As in `layout_map`.
 
@@ -261,28 +341,19 @@ def optimise(
     >>> len(better.scenario.transmitter)
     10
     """
-    rules = rules or Rules()
-    task = _task(scenario, field, rules, criterion, postures or Postures(suns_deg=suns_deg))
+    task = _task(
+        scenario, field, rules, postures or Postures(suns_deg=suns_deg),
+        criterion=criterion, statistic=statistic, costs=costs, starts=starts, seed=seed,
+    )  # fmt: skip
     now = task.scenario.transmitter_enu_m
     with naming(scenario):
-        found = search.optimise(
-            n_transmitter or len(now),
-            task.field,
-            task.constraints,
-            criterion=criterion,
-            statistic=statistic,
-            existing_enu_m=now[: rules.keep] if rules.keep else None,
-            costs=costs,
-            sigma_m=task.sigma_m,
-            starts=starts,
-            seed=seed,
-            progress=on_progress,
-        )
-        better = task.scenario.with_transmitters(maps.check_site(found.transmitter_enu_m), keep=rules.keep)
+        found = task.place(n_transmitter or len(now), on_progress)
+        better = task.scenario.with_transmitters(maps.check_site(found.transmitter_enu_m), keep=task.keep)
+        before = task.value(now)
     return SitePlacement(
         placement=found,
         scenario=better,
-        before=evaluate_placement(now, task.field, criterion=criterion, statistic=statistic, sigma_m=task.sigma_m),
+        before=before,
         before_pdop=evaluate_placement(now, task.field),
         after_pdop=evaluate_placement(found.transmitter_enu_m, task.field),
     )
@@ -292,7 +363,7 @@ def pareto(
     scenario: Site,
     counts: Sequence[int],
     *,
-    criterion: Criterion = "pdop",
+    criterion: SiteCriterion = "pdop",
     statistic: str = "rms",
     rules: Rules | None = None,
     costs: Costs | None = None,
@@ -316,24 +387,17 @@ def pareto(
     ScenarioError
         As `optimise`.
     """
-    rules = rules or Rules()
-    task = _task(scenario, field, rules, criterion, postures or Postures())
-    now = task.scenario.transmitter_enu_m
+    task = _task(
+        scenario, field, rules, postures or Postures(),
+        criterion=criterion, statistic=statistic, costs=costs, starts=starts, seed=seed,
+    )  # fmt: skip
+    found = []
     with naming(scenario):
-        found = search.pareto(
-            counts,
-            task.field,
-            task.constraints,
-            costs=costs,
-            progress=on_progress,
-            criterion=criterion,
-            statistic=statistic,
-            existing_enu_m=now[: rules.keep] if rules.keep else None,
-            sigma_m=task.sigma_m,
-            starts=starts,
-            seed=seed,
-        )
-    return SitePlacements(scenario=task.scenario, found=tuple(found))
+        for k, n in enumerate(counts):
+            found.append(task.place(n, None))
+            if on_progress is not None:
+                on_progress(k + 1, len(counts))
+    return SitePlacements(scenario=task.scenario, found=tuple(search.efficient(found)))
 
 
 def _sigma_m(scenario: Scenario) -> float:
