@@ -23,7 +23,7 @@ from rfpose.feedback.fieldcontrol.emergency import Field, Play, Receiver, play, 
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S
 from rfpose.feedback.fieldcontrol.packets import RESOLUTION_RAD
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Site, sun_position, unix_seconds
 
 SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 NOON_S = unix_seconds(["2024-03-21T10:50:00Z"])[0]

@@ -17,7 +17,7 @@ from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.diagram import draw_modes
 from rfpose.feedback.fieldcontrol.emergency import Field, Play, Receiver, play, ring_field
 from rfpose.feedback.fieldcontrol.modes import Mode, dot
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Site, sun_position, unix_seconds
 
 SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 COLOURS = {Mode.TRACK: "#E69F00", Mode.EMERGENCY: "#D55E00", Mode.STOWING: "#56B4E9", Mode.STOW: "#0072B2"}

@@ -66,6 +66,11 @@ _TOML_TOKEN: Final = re.compile(
 )
 _TOML_LONG_KEY: Final = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{_DEPTH}}}", re.ASCII)
 
+# TOML 1.1 lets a time end with its minutes; Python's reader is of 1.0
+_TOML_MINUTE: Final = re.compile(
+    r"^([ \t]*[\w-]+[ \t]*=[ \t]*\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d)(?=[Zz+\-]|[ \t]*(?:#|\r?$))", re.MULTILINE | re.ASCII
+)
+
 
 def exact_number(name: str, value: Any) -> Fraction:
     """Return a number exactly, without letting its exponent take memory.
@@ -238,6 +243,7 @@ def parse_toml(
     if (chain := _TOML_LONG_KEY.search(bare)) is not None:
         line = bare.count("\n", 0, chain.start()) + 1
         raise error(f"{source}: a key of more than {_DEPTH} parts at line {line}; {remedy}")
+    text = _TOML_MINUTE.sub(r"\1:00", text)
     found: dict[str, Any] = _parsed("TOML", tomllib.loads, text, source, error, remedy)
     _refuse_numbers(found, "", source, error, remedy, finite=False)
     return found

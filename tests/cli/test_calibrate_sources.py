@@ -22,11 +22,11 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect, target_offset_m
 from rfpose.feedback.paint import read_heliostat
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.formats.mount_file import read_models
 from rfpose.pipeline.formats.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario
+from rfpose.sun import Site, sun_position, unix_seconds
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
 SITE = Site(latitude_rad=np.deg2rad(37.1), longitude_rad=np.deg2rad(-2.36), altitude_m=500.0)

@@ -18,7 +18,6 @@ from rfpose.feedback.camera.render import Beam, Target, View, render
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.series import Quantity, read_series_csv
-from rfpose.feedback.sun import Site
 from rfpose.pipeline.aim import plan_commands
 from rfpose.pipeline.calibrate import calibrate
 from rfpose.pipeline.calibration_sources import read_camera, read_drone, read_radio
@@ -33,6 +32,7 @@ from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
+from rfpose.sun import Site
 from rfpose.tables import write_csv
 from rfpose.viewer.models.field_view import field_of_result, field_of_scenario, history
 

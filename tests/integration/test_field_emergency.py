@@ -8,8 +8,8 @@ from rfpose.feedback.fieldcontrol.bus import BusSettings
 from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
 from rfpose.feedback.fieldcontrol.emergency import Field, Receiver, play, ring_field, share_on_receiver
 from rfpose.feedback.fieldcontrol.modes import Event, Mode
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.geometry import bisector_enu, rot_enu_from_mirror, unit
+from rfpose.sun import Site, sun_position, unix_seconds
 
 NOON_S = unix_seconds(["2024-03-21T10:50:00Z"])[0]
 SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))

@@ -16,9 +16,9 @@ from rfpose.feedback.mount import CommandStatus, command
 from rfpose.feedback.paint import enu_from_wgs84, heliostat_ids, read_heliostat
 from rfpose.feedback.prediction import normal_errors_rad
 from rfpose.feedback.selection import fit_chosen
-from rfpose.feedback.sun import sun_position
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits
 from rfpose.pipeline.calibrate import calibrate
+from rfpose.sun import sun_position
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
 pytestmark = pytest.mark.skipif(not PAINT.is_dir(), reason=f"the PAINT records are not at {PAINT}")

@@ -20,7 +20,7 @@ from rfpose.feedback.drone import (
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect
-from rfpose.feedback.sun import Site, sun_position
+from rfpose.sun import Site, sun_position
 
 TARGET = np.array([11.0, 27.0, 4.25])
 START = Mount(pivot_enu_m=np.zeros(3), parameters={"arm_normal_m": 0.4325, "arm_up_m": 0.24})

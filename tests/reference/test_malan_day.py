@@ -8,7 +8,7 @@ from rfpose.feedback.calibration import PARAMETER_SETS, FitSettings, fit
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect, target_offset_m
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Site, sun_position, unix_seconds
 
 SITE = Site(latitude_rad=np.deg2rad(-33.93), longitude_rad=np.deg2rad(18.86), altitude_m=120.0)
 AIM = np.array([0.0, 0.0, 13.0])

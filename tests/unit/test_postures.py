@@ -8,10 +8,10 @@ import pytest
 
 from rfpose import geometry
 from rfpose.errors import ScenarioError
-from rfpose.feedback.sun import site_from_degrees, sun_position
 from rfpose.pipeline.postures import commanded_normals, read_postures
 from rfpose.scenario import load_scenario
 from rfpose.simulator import Simulator
+from rfpose.sun import site_from_degrees, sun_position
 
 TABLE2 = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 NOON_UNIX_S = 1_782_039_600.0 + 60.0 * np.arange(3)  # 2026-06-21 11:00 UTC

@@ -97,8 +97,8 @@ def _plans(
     n_next: int,
 ) -> tuple[Plan, ...]:
     """Plan what the options name."""
-    from rfpose.feedback.sun import site_from_degrees
     from rfpose.pipeline.aim import plan_commands
+    from rfpose.sun import site_from_degrees
 
     place = None if site is None else site_from_degrees(*site)
     return plan_commands(

@@ -13,7 +13,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.calibration import Known, posture_jacobian, predict
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import PARAMETERS, Commands, command
-from rfpose.feedback.sun import Site, Sun, sun_position
+from rfpose.sun import Site, Sun, sun_position
 
 __all__ = ["Design", "Forecast", "forecast", "next_postures"]
 

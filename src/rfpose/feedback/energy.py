@@ -20,7 +20,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.optics import intercept_ratio
 from rfpose.feedback.servo.rules import SLEW_RADPS
-from rfpose.feedback.sun import Site, sun_position
+from rfpose.sun import Site, sun_position
 
 __all__ = [
     "GRIFFITH",

@@ -27,8 +27,8 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.mount import Actuator, Mount
-from rfpose.feedback.sun import Site, unix_seconds
 from rfpose.foreign import load_json
+from rfpose.sun import Site, unix_seconds
 
 __all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "enu_from_wgs84", "heliostat_ids", "read_heliostat"]
 

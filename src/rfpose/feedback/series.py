@@ -13,8 +13,8 @@ import numpy as np
 
 from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.sun import unix_seconds
 from rfpose.foreign import read_text
+from rfpose.sun import unix_seconds
 
 __all__ = ["Quantity", "read_series_csv"]
 

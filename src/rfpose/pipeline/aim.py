@@ -17,9 +17,9 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.design import Forecast, forecast, next_postures
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus
-from rfpose.feedback.sun import Site, unix_seconds
 from rfpose.files import claim
 from rfpose.pipeline.formats.mount_file import StoredMount, read_models
+from rfpose.sun import Site, unix_seconds
 
 __all__ = ["Plan", "plan_commands", "write_commands"]
 

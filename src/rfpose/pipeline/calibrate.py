@@ -17,11 +17,11 @@ from rfpose.feedback.measurements import Measurements, join
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import PaintHeliostat, heliostat_ids, read_heliostat
 from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
-from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
 from rfpose.pipeline.calibration_sources import Gathered, read_camera, read_drone, read_paint, read_radio
 from rfpose.pipeline.formats.mount_file import MountFile, read_models, write_model_file
 from rfpose.shown import Shown, counted, number
+from rfpose.sun import Site
 from rfpose.tables import Tabled
 
 if TYPE_CHECKING:

@@ -27,9 +27,9 @@ from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import heliostat_ids, read_heliostat
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
 from rfpose.foreign import load_toml, read_text
 from rfpose.pipeline.formats.mount_file import MountFile, StoredMount
+from rfpose.sun import Site, sun_position, unix_seconds
 
 if TYPE_CHECKING:
     from rfpose.pipeline.formats.result import Result

@@ -60,6 +60,8 @@ def _scenario(scenario: Scenario) -> dict[str, Any]:
         check_solvable(scenario, pose=POSES[0])
     except (ScenarioError, GeometryError) as error:
         problems.append(str(error))
+    if scenario.impossible_sun:
+        problems.append(scenario.impossible_sun)
     radio = scenario.radio
     return {
         "name": scenario.name,

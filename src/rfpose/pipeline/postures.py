@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +14,9 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError, ScenarioError
-from rfpose.feedback.sun import site_from_degrees, sun_position, unix_seconds
 from rfpose.foreign import read_text
 from rfpose.scenario import Scenario
+from rfpose.sun import unix_seconds
 
 __all__ = ["commanded_normals", "read_postures"]
 
@@ -70,13 +69,11 @@ def commanded_normals(scenario: Scenario, unix_s: npt.ArrayLike, *, simulated: b
     for i, mirror in enumerate(mirrors):
         if mirror.normal_enu is not None:
             _fill(out[:, i], geometry.unit(mirror.normal_enu))
-    suns: list[Callable[[Scenario, FloatArray], FloatArray | None]] = [_sun_at, _simulated_sun]
-    for sun_of in reversed(suns) if simulated else suns:
-        if np.isnan(out).any() and scenario.site.aim_enu_m is not None:
-            sun = sun_of(scenario, time)
-            if sun is not None:
-                to_aim = np.asarray(scenario.site.aim_enu_m) - scenario.mirror_pivot_enu_m
-                _fill(out, geometry.bisector_enu(*np.broadcast_arrays(sun[:, None], to_aim)))
+    suns = [scenario.sun_enu(time), _sun_by_hand(scenario, len(time))]
+    for sun in reversed(suns) if simulated else suns:
+        following = None if sun is None else scenario.following_enu(sun)
+        if following is not None:
+            _fill(out, following)
     unknown = [m.id for m, gone in zip(mirrors, np.isnan(out).any(axis=(0, 2)), strict=True) if gone]
     if unknown and len(time):
         _log.warning(
@@ -91,28 +88,10 @@ def _fill(out: FloatArray, normal: FloatArray) -> None:
     np.copyto(out, normal, where=np.isnan(out))
 
 
-def _sun_at(scenario: Scenario, unix_s: FloatArray) -> FloatArray | None:
-    """(frame, xyz) towards the sun at the frames' times; NaN by night."""
-    site = scenario.site
-    if site.latitude_deg is None or site.longitude_deg is None:
-        return None
-    direction = np.full((len(unix_s), 3), np.nan)
-    known = np.isfinite(unix_s)
-    if known.any():
-        place = site_from_degrees(site.latitude_deg, site.longitude_deg, site.height_m)
-        direction[known] = sun_position(unix_s[known], place).direction_enu
-    direction[direction[:, 2] <= 0.0] = np.nan
-    return direction
-
-
-def _simulated_sun(scenario: Scenario, unix_s: FloatArray) -> FloatArray | None:
-    """(frame, xyz) towards the simulated sun, which goes evenly from its first place to its last."""
-    azimuth, elevation = scenario.simulation.sun_azimuth_deg, scenario.simulation.sun_elevation_deg
-    if azimuth is None or elevation is None:
-        return None
-    share = np.arange(len(unix_s)) / max(scenario.simulation.frame_count - 1, 1)
-    first_last = [np.radians(np.broadcast_to(angle, 2)) for angle in (azimuth, elevation)]
-    return geometry.enu_from_azimuth_elevation(*(a + np.minimum(share, 1.0) * (b - a) for a, b in first_last))
+def _sun_by_hand(scenario: Scenario, n_frame: int) -> FloatArray | None:
+    """(frame, xyz) towards the sun that ``[simulation]`` places by hand, which rests when the simulation has ended."""
+    suns = None if scenario.simulation.sun_azimuth_deg is None else scenario.simulated_suns_enu
+    return None if suns is None else suns[np.minimum(np.arange(n_frame), len(suns) - 1)]
 
 
 def read_postures(path: str | Path, ids: list[str], unix_s: npt.ArrayLike) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from rfpose.simulator import Simulator
 
 __all__ = ["SimulatedRecording", "simulate"]
+
+_log = logging.getLogger(__name__)
 
 
 def simulate(scenario: Scenario | str | Path, *, seed: int = 0) -> SimulatedRecording:
@@ -50,6 +53,8 @@ def simulate(scenario: Scenario | str | Path, *, seed: int = 0) -> SimulatedReco
     (1, 2, 3)
     """
     site = scenario_of(scenario)
+    if site.impossible_sun:
+        _log.warning("%s; leave both angles out, and the sun follows from the site and `start`", site.impossible_sun)
     from rfpose.simulator import Simulator  # compiled code, which no refusal should wait for
 
     file = None if isinstance(scenario, Scenario) else Path(scenario)

@@ -58,6 +58,7 @@ def parse_scenario(text: str, *, source: str = "scenario", scale: float | None =
         file_scale = data.pop("scale", 1.0)
         if not isinstance(file_scale, int | float) or isinstance(file_scale, bool):
             raise ScenarioError(f"`scale` must be a number, got {file_scale!r}")
+        _check_start(data.get("simulation"))
         _fill_heliostats(data)
         fill_structures(data)
         scenario = Scenario.model_validate(data)
@@ -87,6 +88,11 @@ def naming(source: Scenario | str | Path) -> Iterator[None]:
     except (ScenarioError, GeometryError, InvalidInputError) as error:
         place = "" if isinstance(source, Scenario) else f"{source}: "
         raise ScenarioError(f"{place}{error}") from error
+
+
+def _check_start(simulation: Any) -> None:
+    if isinstance(simulation, dict) and {"start", "start_unix_s"} <= simulation.keys():
+        raise ScenarioError("[simulation] gives `start` and `start_unix_s`; keep the one that counts")
 
 
 def _fill_heliostats(data: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
-from rfpose import geometry
+from rfpose import geometry, sun
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import ScenarioError
 from rfpose.files import write_atomically
@@ -191,29 +191,105 @@ class Scenario(Record):
         """
         return heliostat.oscillator == "shared" and heliostat.carrier_phase and self.has_rf_carriers
 
+    def sun_enu(self, unix_s: npt.ArrayLike) -> FloatArray | None:
+        """Return the sun over the site (time, xyz), as unit vectors; None where the site's place is not told.
+
+        Parameters
+        ----------
+        unix_s : (time,)
+            [s since 1970 UTC]. NaN: unknown.
+
+        Returns
+        -------
+        (time, xyz)
+            NaN by night, and at unknown times.
+        """
+        site = self.site
+        if site.latitude_deg is None or site.longitude_deg is None:
+            return None
+        time = as_float_array("unix_s", unix_s, ("time",), finite=False)
+        direction = np.full((len(time), 3), np.nan)
+        known = np.isfinite(time)
+        if known.any():
+            place = sun.site_from_degrees(site.latitude_deg, site.longitude_deg, site.height_m)
+            direction[known] = sun.sun_position(time[known], place).direction_enu
+        direction[direction[:, 2] <= 0.0] = np.nan
+        return direction
+
+    @cached_property
+    def simulated_suns_enu(self) -> FloatArray | None:
+        """(frame, xyz) towards the sun of each simulated frame; None where the scenario does not tell it.
+
+        As ``[simulation]`` places it by hand, evenly from first to last; else that of the site at the frames' times,
+        NaN by night.
+        """
+        simulation = self.simulation
+        by_hand = (simulation.sun_azimuth_deg, simulation.sun_elevation_deg)
+        if by_hand == (None, None):
+            interval_s = simulation.frame_interval_s or self.radio.frame_samples / self.radio.sample_rate_hz
+            suns = self.sun_enu(simulation.start_unix_s + interval_s * np.arange(simulation.frame_count))
+            return None if suns is None else read_only(suns)
+        if None in by_hand:
+            return None
+        share = np.linspace(0.0, 1.0, simulation.frame_count)
+        first_last = [np.radians(np.broadcast_to(np.array(angle, np.float64), 2)) for angle in by_hand]
+        return read_only(geometry.enu_from_azimuth_elevation(*(a + share * (b - a) for a, b in first_last)))
+
     @cached_property
     def simulated_sun_enu(self) -> FloatArray | None:
-        """(xyz,) towards the simulated sun of the first frame; None where the scenario lacks it, or an aim point."""
-        azimuth, elevation = self.simulation.sun_azimuth_deg, self.simulation.sun_elevation_deg
-        if azimuth is None or elevation is None or self.site.aim_enu_m is None:
+        """(xyz,) towards the simulated sun of the first frame; None by night, and without it or an aim point."""
+        suns = None if self.site.aim_enu_m is None else self.simulated_suns_enu
+        return None if suns is None or not np.isfinite(suns[0]).all() else suns[0]
+
+    def following_enu(self, sun_enu: FloatArray) -> FloatArray | None:
+        """Return the normals of `mirrors` that follow a sun: they send it to the aim point; dishes face it.
+
+        Parameters
+        ----------
+        sun_enu : (time, xyz)
+
+        Returns
+        -------
+        (time, mirror, xyz)
+            NaN where the sun is, and where it is opposite to the aim point. None: heliostats without an aim point.
+        """
+        n_mirror = len(self.mirrors)
+        if self.tracking.collector == "dish":
+            return np.repeat(sun_enu[:, None], n_mirror, axis=1)
+        if self.site.aim_enu_m is None:
             return None
-        first = [np.radians(np.ravel(angle)[0]) for angle in (azimuth, elevation)]
-        return read_only(geometry.enu_from_azimuth_elevation(*first))
+        to_aim = np.asarray(self.site.aim_enu_m) - self.mirror_pivot_enu_m
+        return geometry.bisector_enu(*np.broadcast_arrays(sun_enu[:, None], to_aim))
 
     @cached_property
     def posture_enu(self) -> FloatArray:
         """(heliostat, xyz) unit normals that the scenario gives its mirrors; NaN where it gives none.
 
-        Each heliostat's own ``normal_enu``; else that which sends the simulated sun of the first frame to the aim
-        point, as `rfpose simulate` begins. Whatever shows or studies "the scenario's posture" takes it from here.
+        Each heliostat's own ``normal_enu``; else that which follows the simulated sun of the first frame, as `rfpose
+        simulate` begins. Whatever shows or studies "the scenario's posture" takes it from here.
         """
         out = np.full((len(self.heliostat), 3), np.nan)
-        if self.simulated_sun_enu is not None and self.heliostat:
-            out = geometry.bisector_enu(np.array(self.site.aim_enu_m) - self.pivot_enu_m, self.simulated_sun_enu)
+        suns = self.simulated_suns_enu
+        following = None if suns is None or not self.heliostat else self.following_enu(suns[:1])
+        if following is not None:
+            out = following[0, : len(self.heliostat)].copy()
         for i, heliostat in enumerate(self.heliostat):
             if heliostat.normal_enu is not None:
                 out[i] = geometry.unit(heliostat.normal_enu)
         return read_only(out)
+
+    @cached_property
+    def impossible_sun(self) -> str:
+        """Why no sun stands where ``[simulation]`` places it by hand at this latitude; empty where one may."""
+        azimuth, elevation = self.simulation.sun_azimuth_deg, self.simulation.sun_elevation_deg
+        if azimuth is None or elevation is None:
+            return ""
+        first_last = [np.broadcast_to(np.array(angle, np.float64), 2).tolist() for angle in (azimuth, elevation)]
+        for azimuth_deg, elevation_deg in zip(*first_last, strict=True):
+            why = sun.why_never(azimuth_deg, elevation_deg, self.site.latitude_deg)
+            if why:
+                return f"[simulation] places the sun at azimuth {azimuth_deg:g}°, elevation {elevation_deg:g}°: {why}"
+        return ""
 
     def scaled(self, factor: float) -> Scenario:
         """Return the scenario with every length, and every tone's wavelength, multiplied by ``factor``.

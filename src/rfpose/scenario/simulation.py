@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from rfpose.errors import InvalidInputError
 from rfpose.scenario.records import MAX_START_UNIX_S, Identifier, NonNegative, Positive, Record
+from rfpose.sun import unix_seconds
 
 
 class Ground(Record):
@@ -44,10 +47,26 @@ PathPattern = Annotated[str, Field(min_length=1, max_length=200)]
 class Simulation(Record):
     """How `rfpose simulate` makes a recording of this scenario."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _starts_at_a_time(cls, data: Any) -> Any:
+        """Take ``start``, a time of day and date, for the seconds that count."""
+        if not isinstance(data, Mapping) or "start" not in data:
+            return data
+        rest = {key: value for key, value in data.items() if key != "start"}
+        try:
+            seconds = float(unix_seconds([data["start"]])[0])
+        except InvalidInputError as error:
+            raise ValueError(f"`start`: {error}") from error
+        if seconds != round(seconds):
+            raise ValueError(f"`start` must be a whole second, got {data['start']}")
+        return {**rest, "start_unix_s": round(seconds)}
+
     frame_count: Annotated[int, Field(gt=0)] = 4
     frame_interval_s: NonNegative = 0.0
     """Start to start; zero records frames back to back."""
     start_unix_s: Annotated[int, Field(ge=0, le=MAX_START_UNIX_S)] = 1_782_043_200
+    """First sample, in whole seconds since 1970 UTC; a file may give it as ``start``, a date and time."""
     tone_snr_db: float = 40.0
     """First tone of a transmitter of amplitude one at the reference range, against all noise in the recorded
     band, per sample: ``(a m)² / σ²`` with σ² the variance of the complex noise."""
@@ -64,7 +83,7 @@ class Simulation(Record):
     receiver_delay_drift_s_per_sqrt_min: NonNegative = 0.0
     transmitter_phase_drift_rad_per_sqrt_h: NonNegative = 0.0
     sun_azimuth_deg: float | tuple[float, float] | None = None
-    """One value, or the values at the first and the last frame."""
+    """One value, or the values at the first and the last frame; without both the sun follows from site and time."""
     sun_elevation_deg: float | tuple[float, float] | None = None
     ground: Ground | None = None
     blocked: tuple[Blockage, ...] = ()

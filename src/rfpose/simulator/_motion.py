@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.scenario import MAX_SAMPLE_INDEX, Heliostat, Scenario
+from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario
 from rfpose.scenario.records import MAX_START_UNIX_S
 
 __all__ = ["frame_start_index", "mirror_normal_enu", "receiver_enu_m"]
@@ -65,40 +65,55 @@ def mirror_normal_enu(scenario: Scenario) -> FloatArray:
         if heliostat.normal_enu is not None:
             normal[:, i] = geometry.unit(heliostat.normal_enu)
         else:
-            normal[:, i] = _tracking_normal(scenario, heliostat)
+            normal[:, i] = _tracking_normal(scenario, i)
     return normal
 
 
-def _tracking_normal(scenario: Scenario, heliostat: Heliostat) -> FloatArray:
-    azimuth, elevation = scenario.simulation.sun_azimuth_deg, scenario.simulation.sun_elevation_deg
-    aim = scenario.site.aim_enu_m
-    if azimuth is None or elevation is None or aim is None:
-        wanted = {
-            "simulation.sun_azimuth_deg": azimuth,
-            "simulation.sun_elevation_deg": elevation,
-            "site.aim_enu_m": aim,
-        }
-        missing = ", ".join(f"`{key}`" for key, value in wanted.items() if value is None)
+def _tracking_normal(scenario: Scenario, i: int) -> FloatArray:
+    heliostat, suns = scenario.heliostat[i], scenario.simulated_suns_enu
+    following = None if suns is None else scenario.following_enu(suns)
+    if suns is None or following is None:
         raise ScenarioError(
-            f"heliostat `{heliostat.id}` has no posture to simulate: give its `normal_enu`, or give {missing}"
+            f"heliostat `{heliostat.id}` has no posture to simulate: give its `normal_enu`, or give "
+            f"{_missing_for_sun(scenario)}"
         )
-    to_aim = np.asarray(aim) - np.asarray(heliostat.pivot_enu_m)
-    if np.linalg.norm(to_aim) < _MIN_RANGE_M:
-        raise ScenarioError(f"heliostat `{heliostat.id}` stands at `site.aim_enu_m`; move one, or give `normal_enu`")
-    n_frame = scenario.simulation.frame_count
-    sun = geometry.enu_from_azimuth_elevation(_over_frames(azimuth, n_frame), _over_frames(elevation, n_frame))
-    normal = geometry.bisector_enu(sun, np.broadcast_to(to_aim, sun.shape))
-    if not np.all(np.isfinite(normal)):
+    night = np.flatnonzero(np.isnan(suns).any(axis=-1))
+    if night.size:
+        raise ScenarioError(
+            f"at frame {night[0]} the sun is below the horizon of the site: change `simulation.start`, "
+            f"`site.latitude_deg` or `site.longitude_deg`, or give heliostat `{heliostat.id}` a `normal_enu`"
+        )
+    if scenario.site.aim_enu_m is not None:
+        to_aim = np.asarray(scenario.site.aim_enu_m) - np.asarray(heliostat.pivot_enu_m)
+        if np.linalg.norm(to_aim) < _MIN_RANGE_M:
+            raise ScenarioError(
+                f"heliostat `{heliostat.id}` stands at `site.aim_enu_m`; move one, or give `normal_enu`"
+            )
+    if not np.all(np.isfinite(following[:, i])):
         raise ScenarioError(
             f"heliostat `{heliostat.id}`: sun and aim point are opposite, no normal reflects one to the other; "
             "change `simulation.sun_azimuth_deg`, or give `normal_enu`"
         )
-    return normal
+    return following[:, i]
 
 
-def _over_frames(value_deg: float | tuple[float, float], n_frame: int) -> FloatArray:
-    first, last = value_deg if isinstance(value_deg, tuple) else (value_deg, value_deg)
-    return np.radians(np.linspace(first, last, n_frame))
+def _missing_for_sun(scenario: Scenario) -> str:
+    simulation, site = scenario.simulation, scenario.site
+    sun = {
+        "simulation.sun_azimuth_deg": simulation.sun_azimuth_deg,
+        "simulation.sun_elevation_deg": simulation.sun_elevation_deg,
+    }
+    missing = [f"`{key}`" for key, value in sun.items() if value is None]
+    if len(missing) == len(sun):
+        missing = [
+            "`site.latitude_deg` and `site.longitude_deg` (for the sun of `simulation.start`) or "
+            + " and ".join(missing)
+        ]
+    if scenario.simulated_suns_enu is not None:
+        missing = []
+    if site.aim_enu_m is None and scenario.tracking.collector != "dish":
+        missing.append("`site.aim_enu_m`")
+    return ", ".join(missing)
 
 
 def receiver_enu_m(scenario: Scenario, normal_enu: FloatArray) -> FloatArray:

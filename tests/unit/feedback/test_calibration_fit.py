@@ -22,8 +22,8 @@ from rfpose.feedback.calibration import (
 from rfpose.feedback.design import forecast, next_postures
 from rfpose.feedback.measurements import Measurements, join
 from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, command, posture
-from rfpose.feedback.sun import Site
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits, rolling_refit
+from rfpose.sun import Site
 
 START = Mount(pivot_enu_m=np.array([20.0, 80.0, 3.0]))
 TRUE = START.replace(

@@ -14,7 +14,7 @@ from rfpose.feedback.energy import (
     spillage,
 )
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.feedback.sun import Site
+from rfpose.sun import Site
 
 CANBERRA = Site(latitude_rad=np.deg2rad(-35.0), longitude_rad=np.deg2rad(149.0))
 

@@ -12,7 +12,6 @@ from rfpose.feedback.energy import dish_capture_at, dish_efficiency
 from rfpose.feedback.mount import PARAMETERS
 from rfpose.feedback.optics import intercept_ratio
 from rfpose.feedback.structure import Structure
-from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking import METHODS, _kernels
 from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import draw_field, field_positions
@@ -28,6 +27,7 @@ from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.measurement import Estimator, noise_of
 from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
+from rfpose.sun import sun_position
 
 ROOT = Path(__file__).resolve().parents[3]
 DATA = ROOT / "data" / "tracking_100m.toml"

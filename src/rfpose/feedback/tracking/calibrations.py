@@ -16,7 +16,6 @@ from rfpose.feedback import _kernels
 from rfpose.feedback.calibration import PARAMETER_SETS, FitSettings, solve
 from rfpose.feedback.columns import M, columns_of, constant
 from rfpose.feedback.mount import aim_rows
-from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking.hidden import TILTS, WORMS, ZEROS, generator
 from rfpose.feedback.tracking.instruments import CameraSpots, DroneFlights, Instrument, RadioPoses, measure, plate_looks
 from rfpose.feedback.tracking.methods import Knowledge, Method
@@ -24,6 +23,7 @@ from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.postures import Postures, aimed
 from rfpose.feedback.tracking.radio import RadioModel
 from rfpose.feedback.tracking.timeline import Day, heat_of, hour_of_day, look_times, site_of
+from rfpose.sun import sun_position
 
 __all__ = [
     "LEARNED",

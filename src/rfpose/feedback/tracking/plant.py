@@ -12,7 +12,6 @@ from rfpose.errors import ScenarioError
 from rfpose.feedback import _kernels
 from rfpose.feedback.columns import constant
 from rfpose.feedback.mount import CommandStatus
-from rfpose.feedback.sun import sun_position
 from rfpose.feedback.tracking.capture import capture_table
 from rfpose.feedback.tracking.hidden import azimuth_course_rad, draw_field
 from rfpose.feedback.tracking.postures import Postures, aim_count, aimed
@@ -20,6 +19,7 @@ from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import Day, days, heat_of, hour_of_day, look_times, site_of
 from rfpose.feedback.tracking.wind import Gusts
 from rfpose.scenario import Scenario
+from rfpose.sun import sun_position
 
 __all__ = ["Plant"]
 

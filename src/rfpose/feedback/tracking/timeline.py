@@ -11,9 +11,9 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import ScenarioError
 from rfpose.feedback.energy import clear_beam_w_m2
-from rfpose.feedback.sun import Site, sun_position
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Tracking
+from rfpose.sun import Site, sun_position
 
 __all__ = ["Day", "day_of", "days", "heat_of", "hour_of_day", "look_times", "site_of", "ways_s"]
 

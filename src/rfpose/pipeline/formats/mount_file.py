@@ -21,10 +21,10 @@ from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.calibrated import Choice, Known, resolve_free
 from rfpose.feedback.mount import Actuator, Mount
-from rfpose.feedback.sun import Site, site_from_degrees
 from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
 from rfpose.kinds import told_kind
+from rfpose.sun import Site, site_from_degrees
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "read_models", "write_model_file"]
 

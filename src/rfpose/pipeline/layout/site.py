@@ -12,8 +12,6 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.feedback.sun import Site as SunSite
-from rfpose.feedback.sun import sun_position
 from rfpose.geometry import (
     azimuth_elevation_from_enu,
     bisector_enu,
@@ -26,6 +24,8 @@ from rfpose.layout.maps import Mirrors
 from rfpose.layout.sight import Plates, Tower
 from rfpose.multilat import check_unambiguous
 from rfpose.scenario import Scenario, naming, scenario_of
+from rfpose.sun import Site as SunSite
+from rfpose.sun import sun_position
 
 __all__ = ["Field", "Posture", "Postures", "Sight", "Site", "Sun", "load_site", "postures_of", "stacked"]
 

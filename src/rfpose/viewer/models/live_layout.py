@@ -149,7 +149,7 @@ def sun_of(scenario: Scenario, moment: datetime) -> SunPlace:
     ScenarioError
         The scenario does not say where the site is.
     """
-    from rfpose.feedback.sun import Site, sun_position, unix_seconds
+    from rfpose.sun import Site, sun_position, unix_seconds
 
     place = scenario.site
     if place.latitude_deg is None or place.longitude_deg is None:

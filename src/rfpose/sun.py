@@ -13,12 +13,14 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Site", "Sun", "site_from_degrees", "sun_position", "unix_seconds"]
+__all__ = ["Site", "Sun", "site_from_degrees", "sun_position", "unix_seconds", "why_never"]
 
 # ΔT = TT − UT1 has been 69 s to within 0.4 s since 2017; a second is 0.2 µrad of the sun's own motion.
 _DELTA_T_S = 69.2
 _ALTITUDES_M = (-500.0, 9000.0)
 _YEARS = (1900, 2200)
+# obliquity of the ecliptic, with what refraction lifts at the horizon
+_GREATEST_DECLINATION_DEG = 23.44 + 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,3 +189,29 @@ def sun_position(unix_s: npt.ArrayLike, site: Site) -> Sun:
         elevation_rad=elevation,
         direction_enu=geometry.enu_from_azimuth_elevation(azimuth, elevation),
     )
+
+
+def why_never(azimuth_deg: float, elevation_deg: float, latitude_deg: float | None) -> str:
+    """Say why the sun never stands in a direction at a latitude; empty where it may.
+
+    Parameters
+    ----------
+    azimuth_deg, elevation_deg
+        From north, clockwise; above the horizon [deg].
+    latitude_deg
+        None: anywhere on Earth.
+
+    Notes
+    -----
+    Of the triangle pole, zenith, sun: sin δ = sin φ sin h + cos φ cos h cos A, and |δ| never exceeds the obliquity.
+    """
+    if not 0.0 <= elevation_deg <= 90.0:
+        return "below the horizon" if elevation_deg < 0.0 else "beyond the zenith"
+    if latitude_deg is None:
+        return ""
+    azimuth, elevation, latitude = np.radians([azimuth_deg, elevation_deg, latitude_deg])
+    sine = np.sin(latitude) * np.sin(elevation) + np.cos(latitude) * np.cos(elevation) * np.cos(azimuth)
+    declination = float(np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))))
+    if abs(declination) <= _GREATEST_DECLINATION_DEG:
+        return ""
+    return f"at latitude {latitude_deg:g}° none reaches it (declination {declination:.1f}°, ±23.4° at most)"

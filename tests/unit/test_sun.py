@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Site, sun_position, unix_seconds
 
 GOLDEN = Site(
     latitude_rad=np.deg2rad(39.742476),
