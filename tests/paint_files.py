@@ -13,7 +13,8 @@ import numpy as np
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.feedback.mount import Mount, command
-from rfpose.feedback.paint import enu_from_wgs84, read_heliostat
+from rfpose.feedback.paint import read_heliostat
+from rfpose.geometry import enu_from_wgs84
 
 ORIGIN = (50.9, 6.4, 90.0)
 TARGET = "tower_target"

@@ -28,6 +28,7 @@ __all__ = [
     "ARRAY_BYTES",
     "RATE_LIMITS",
     "TEXT_BYTES",
+    "beside",
     "exact_number",
     "exact_rate",
     "load_json",
@@ -137,6 +138,12 @@ def _short(number: Fraction) -> str:
         return f"{float(number):.6g}"
     except OverflowError:  # an integer may have any number of digits
         return f"{'-' if number < 0 else ''}1e+{int(abs(number).numerator.bit_length() * math.log10(2))} or so"
+
+
+def beside(name: str | Path, folder: Path | None) -> Path:
+    """Return the file that another one names: beside that, in ``folder``, else from where the program runs."""
+    near = Path(name) if folder is None else folder / name
+    return Path(name) if Path(name).exists() and not near.exists() else near
 
 
 def read_text(

@@ -19,10 +19,13 @@ __all__ = [
     "bisector_enu",
     "cross_matrix",
     "enu_from_azimuth_elevation",
+    "enu_from_wgs84",
     "is_collinear",
     "rot_enu_from_mirror",
     "unit",
 ]
+
+_WGS84_A, _WGS84_E2 = 6378137.0, 6.69437999014e-3
 
 
 def unit(vector: npt.ArrayLike) -> FloatArray:
@@ -164,3 +167,40 @@ def cross_matrix(vector: FloatArray) -> FloatArray:
     out[..., 1, 0], out[..., 1, 2] = vector[..., 2], -vector[..., 0]
     out[..., 2, 0], out[..., 2, 1] = -vector[..., 1], vector[..., 0]
     return out
+
+
+def enu_from_wgs84(latitude_longitude_height: npt.ArrayLike, origin: npt.ArrayLike) -> FloatArray:
+    """Return positions in the ENU frame about an origin, by way of ECEF.
+
+    Parameters
+    ----------
+    latitude_longitude_height : (..., 3)
+        WGS84 [deg, deg, m].
+    origin : (3,)
+        The same, of the site frame's origin.
+
+    Returns
+    -------
+    (..., xyz)
+        Site ENU [m].
+    """
+    start = np.asarray(origin, np.float64)
+    difference = _ecef(np.asarray(latitude_longitude_height, np.float64)) - _ecef(start)
+    latitude, longitude = np.radians(start[:2])
+    s, c, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
+    enu_from_ecef = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
+    return np.asarray(difference @ enu_from_ecef.T)
+
+
+def _ecef(position: FloatArray) -> FloatArray:
+    latitude, longitude, height = np.radians(position[..., 0]), np.radians(position[..., 1]), position[..., 2]
+    prime = _WGS84_A / np.sqrt(1.0 - _WGS84_E2 * np.sin(latitude) ** 2)
+    across = (prime + height) * np.cos(latitude)
+    return np.stack(
+        [
+            across * np.cos(longitude),
+            across * np.sin(longitude),
+            (prime * (1.0 - _WGS84_E2) + height) * np.sin(latitude),
+        ],
+        axis=-1,
+    )

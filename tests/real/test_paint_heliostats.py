@@ -13,10 +13,11 @@ from rfpose.feedback.alarms import alarms
 from rfpose.feedback.calibration import FitStatus, fit
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus, command
-from rfpose.feedback.paint import enu_from_wgs84, heliostat_ids, read_heliostat
+from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.feedback.prediction import normal_errors_rad
 from rfpose.feedback.selection import fit_chosen
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits
+from rfpose.geometry import enu_from_wgs84
 from rfpose.pipeline.calibrate import calibrate
 from rfpose.sun import sun_position
 

@@ -27,10 +27,11 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.mount import Actuator, Mount
-from rfpose.foreign import load_json
+from rfpose.geometry import enu_from_wgs84
+from rfpose.scenario.paint import heliostat_place, key_of, origin_of, place_of, properties_of, read_object
 from rfpose.sun import Site, unix_seconds
 
-__all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "enu_from_wgs84", "heliostat_ids", "read_heliostat"]
+__all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "heliostat_ids", "read_heliostat"]
 
 ALGORITHMS = ("HeliOS", "UTIS")
 CHOICES = ("both", "any", *ALGORITHMS)
@@ -48,8 +49,6 @@ _ARMS = {
 _NO_PLACE = tuple(f"joint_translation_{axis}_{joint}" for joint in (1, 2) for axis in "enu")
 _PLANE_M = 0.5
 _FARTHEST_M = 1e5
-_HIGHEST_M = 1e4
-_WGS84_A, _WGS84_E2 = 6378137.0, 6.69437999014e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,43 +147,6 @@ class PaintHeliostat:
         return np.where(known, self.unix_s, np.interp(number, number[known], self.unix_s[known]))
 
 
-def enu_from_wgs84(latitude_longitude_height: npt.ArrayLike, origin: npt.ArrayLike) -> FloatArray:
-    """Return positions in the ENU frame about an origin, by way of ECEF.
-
-    Parameters
-    ----------
-    latitude_longitude_height : (..., 3)
-        WGS84 [deg, deg, m].
-    origin : (3,)
-        The same, of the site frame's origin.
-
-    Returns
-    -------
-    (..., xyz)
-        Site ENU [m].
-    """
-    start = np.asarray(origin, np.float64)
-    difference = _ecef(np.asarray(latitude_longitude_height, np.float64)) - _ecef(start)
-    latitude, longitude = np.radians(start[:2])
-    s, c, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
-    enu_from_ecef = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
-    return np.asarray(difference @ enu_from_ecef.T)
-
-
-def _ecef(position: FloatArray) -> FloatArray:
-    latitude, longitude, height = np.radians(position[..., 0]), np.radians(position[..., 1]), position[..., 2]
-    prime = _WGS84_A / np.sqrt(1.0 - _WGS84_E2 * np.sin(latitude) ** 2)
-    across = (prime + height) * np.cos(latitude)
-    return np.stack(
-        [
-            across * np.cos(longitude),
-            across * np.sin(longitude),
-            (prime * (1.0 - _WGS84_E2) + height) * np.sin(latitude),
-        ],
-        axis=-1,
-    )
-
-
 def heliostat_ids(directory: Path) -> tuple[str, ...]:
     """Return the names of the heliostats that have calibration records in a PAINT directory.
 
@@ -241,13 +203,9 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
         raise RecordingError(
             f"{folder}: no calibration records; known heliostats: {', '.join(heliostat_ids(directory))}"
         )
-    tower_path = _one_file(directory, r"tower.measurements\.json$", "the tower's measurements")
-    tower = _read_json(tower_path)
-    plant = _key(tower, tower_path, "power_plant_properties")
-    origin = _place(_key(plant, tower_path, "coordinates"), f"{tower_path}: power_plant_properties.coordinates")
+    origin, tower, tower_path = origin_of(directory)
     targets = _targets(tower, tower_path, origin)
-    path = _one_file(folder, rf"({re.escape(heliostat)}.*|heliostat.)properties\.json$", "the heliostat's properties")
-    mount = _mount(_read_json(path), path, origin)
+    mount = _mount(*properties_of(folder), origin)
     rows: list[_Record] = []
     skipped: dict[str, str] = {}
     for number, file in files.items():
@@ -300,11 +258,11 @@ class _Record:
 
 def _record(number: int, file: Path, targets: Mapping[str, Target], origin: FloatArray, algorithm: str) -> _Record:
     """Read a record, or say why it cannot be used."""
-    record = _read_json(file)
-    spots = enu_from_wgs84([_place(*spot) for spot in _spots(record, file, algorithm)], origin)
-    motors = _key(record, file, "motor_position")
-    count = [_number(_key(motors, file, name), file, f"motor_position.{name}") for name in _MOTORS]
-    sun = [_number(_key(record, file, name), file, name) for name in ("sun_azimuth", "sun_elevation")]
+    record = read_object(file)
+    spots = enu_from_wgs84([place_of(*spot) for spot in _spots(record, file, algorithm)], origin)
+    motors = key_of(record, file, "motor_position")
+    count = [_number(key_of(motors, file, name), file, f"motor_position.{name}") for name in _MOTORS]
+    sun = [_number(key_of(record, file, name), file, name) for name in ("sun_azimuth", "sun_elevation")]
     if not 0.0 < sun[1] <= 90.0:
         where = "below the horizon" if sun[1] <= 0.0 else "beyond the zenith"
         raise RecordingError(f"{file}: sun {where} (sun_elevation {sun[1]:g} degrees); records need the sun in the sky")
@@ -346,45 +304,10 @@ def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
     return dict(sorted(found.items()))
 
 
-def _one_file(folder: Path, pattern: str, what: str) -> Path:
-    """Find the file below ``folder`` whose name ends as the pattern says."""
-    paths = sorted(p for p in folder.rglob("*.json") if re.search(pattern, p.name) and "alibration" not in p.name)
-    if not paths:
-        raise RecordingError(f"{folder}: no file for {what} (name like {pattern!r}); fetch it from PAINT")
-    return paths[0]
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    content = load_json(path, remedy="fetch it again")
-    if not isinstance(content, dict):
-        raise RecordingError(f"{path}: must hold one JSON object, got a {type(content).__name__}; fetch it again")
-    return content
-
-
-def _key(content: Any, path: Path, key: str) -> Any:
-    if not isinstance(content, dict) or key not in content:
-        raise RecordingError(f"{path}: has no {key!r}; fetch it again")
-    return content[key]
-
-
 def _number(value: Any, path: Path, key: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise RecordingError(f"{path}: {key}: a number was expected, got {value!r:.40}; correct it")
     return float(value)
-
-
-def _place(value: Any, where: str) -> FloatArray:
-    """Latitude, longitude and height out of a file."""
-    if (
-        not isinstance(value, list)
-        or len(value) != 3
-        or any(isinstance(x, bool) or not isinstance(x, int | float) for x in value)
-    ):
-        raise RecordingError(f"{where}: [latitude, longitude, height] was expected, got {value!r:.60}; correct it")
-    place = np.array(value, np.float64)
-    if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 360.0 and abs(place[2]) <= _HIGHEST_M):
-        raise RecordingError(f"{where}: must be degrees and metres on Earth, got {value!r:.60}; correct it")
-    return place
 
 
 def _times(directory: Path, heliostat: str, numbers: Sequence[int]) -> tuple[FloatArray, tuple[str, ...]]:
@@ -392,7 +315,7 @@ def _times(directory: Path, heliostat: str, numbers: Sequence[int]) -> tuple[Flo
     path = directory / "timestamps.json"
     stated: dict[int, tuple[Any, str]] = {}
     if path.exists():
-        table = _read_json(path)
+        table = read_object(path)
         stated = {
             n: (table[f"{heliostat}_{n}"], f"{path}: {heliostat}_{n}") for n in numbers if f"{heliostat}_{n}" in table
         }
@@ -404,7 +327,9 @@ def _times(directory: Path, heliostat: str, numbers: Sequence[int]) -> tuple[Flo
                 text, where = stated[number]
             elif number in items:
                 where = f"{items[number]}: properties.datetime"
-                text = _key(_key(_read_json(items[number]), items[number], "properties"), items[number], "datetime")
+                text = key_of(
+                    key_of(read_object(items[number]), items[number], "properties"), items[number], "datetime"
+                )
             else:
                 continue
             seconds[i] = _moment(text, where)
@@ -436,12 +361,12 @@ def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray)
 
     PAINT's is grid north for every target, 2.8 to 5.5 mrad off the plane of the corners.
     """
-    coordinates = _key(entry, path, "coordinates")
+    coordinates = key_of(entry, path, "coordinates")
     if not isinstance(coordinates, dict) or "center" not in coordinates:
         raise RecordingError(f"{path}: {name}.coordinates has no 'center'; fetch it again")
-    places = {key: _place(value, f"{path}: {name}.coordinates.{key}") for key, value in coordinates.items()}
+    places = {key: place_of(value, f"{path}: {name}.coordinates.{key}") for key, value in coordinates.items()}
     centre = enu_from_wgs84(places.pop("center"), origin)
-    front = _key(entry, path, "normal_vector")
+    front = key_of(entry, path, "normal_vector")
     if not isinstance(front, list) or len(front) != 3 or not all(isinstance(x, int | float) for x in front):
         raise RecordingError(f"{path}: {name}.normal_vector: [east, north, up] was expected, got {front!r:.40}")
     normal = geometry.unit(front)
@@ -458,10 +383,10 @@ def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray)
     )
 
 
-def _mount(properties: Mapping[str, Any], path: Path, origin: FloatArray) -> Mount:
+def _mount(properties: dict[str, Any], path: Path, origin: FloatArray) -> Mount:
     """Mount of a heliostat whose axis 1 lies east-west and whose axis 2 lies in the mirror's plane."""
-    kinematics = _key(properties, path, "kinematics_properties")
-    entries = _key(kinematics, path, "actuators")
+    kinematics = key_of(properties, path, "kinematics_properties")
+    entries = key_of(kinematics, path, "actuators")
     if not isinstance(entries, list) or len(entries) != 2:
         raise RecordingError(f"{path}: kinematics_properties.actuators: two were expected, got {entries!r:.40}")
     _refuse_other_geometry(properties, kinematics, path)
@@ -470,9 +395,7 @@ def _mount(properties: Mapping[str, Any], path: Path, origin: FloatArray) -> Mou
         for parameter, key in _ARMS.items()
     }
     return Mount(
-        pivot_enu_m=enu_from_wgs84(
-            _place(_key(properties, path, "heliostat_position"), f"{path}: heliostat_position"), origin
-        ),
+        pivot_enu_m=heliostat_place(properties, path, origin),
         rot_enu_from_mount=_MOUNT_FRAME,
         # axis 1 lowers the normal towards south as it opens; axis 2 turns it about the mirror's own upright
         actuators=(_actuator(entries[0], path, 1), _actuator(entries[1], path, 2)),
@@ -501,9 +424,9 @@ def _actuator(entry: Any, path: Path, axis: int) -> Actuator:
     place = f"kinematics_properties.actuators[{axis - 1}]"
 
     def value(name: str) -> float:
-        return _number(_key(entry, path, name), path, f"{place}.{name}")
+        return _number(key_of(entry, path, name), path, f"{place}.{name}")
 
-    kind = _key(entry, path, "type_axis")
+    kind = key_of(entry, path, "type_axis")
     if kind != "linear":
         raise RecordingError(
             f"{path}: {place}.type_axis: only linear actuators are known in this layout, got {kind!r:.40}; "

@@ -11,7 +11,7 @@ from rfpose.scenario._scenario import Receiver, Scenario, check_scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
 from rfpose.scenario.multipath import Antenna, Multipath
-from rfpose.scenario.positions import read_positions
+from rfpose.scenario.positions import Columns, PositionForm, read_positions
 from rfpose.scenario.records import (
     ID_PATTERN,
     MAX_FRAME_SAMPLES,
@@ -41,6 +41,7 @@ __all__ = [
     "Box",
     "Budget",
     "CalibrationReceiver",
+    "Columns",
     "Dropout",
     "Ground",
     "Heliostat",
@@ -49,6 +50,7 @@ __all__ = [
     "Motion",
     "Multipath",
     "Plane",
+    "PositionForm",
     "Posture",
     "Radio",
     "Receiver",

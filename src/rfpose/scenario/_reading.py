@@ -14,6 +14,7 @@ from rfpose.foreign import parse_toml, read_text
 from rfpose.kinds import told_kind
 from rfpose.scenario._scenario import Scenario
 from rfpose.scenario._words import in_words
+from rfpose.scenario.field_table import add_listed
 from rfpose.scenario.records import Mirror
 from rfpose.scenario.site import fill_structures
 
@@ -48,19 +49,25 @@ def load_scenario(path: str | Path, *, scale: float | None = None) -> Scenario:
     if instead := told_kind(path, wanted="scenario"):
         raise ScenarioError(f"{path}: no scenario, but {instead}; give a site in TOML, as docs/scenario.md has it")
     text = read_text(path, limit=SCENARIO_BYTES, error=ScenarioError, remedy=_REMEDY)
-    return parse_scenario(text, source=str(path), scale=scale)
+    return parse_scenario(text, source=str(path), scale=scale, folder=Path(path).parent)
 
 
-def parse_scenario(text: str, *, source: str = "scenario", scale: float | None = None) -> Scenario:
-    """Check a scenario given as TOML text; see `load_scenario`. ``source`` names it in messages."""
+def parse_scenario(
+    text: str, *, source: str = "scenario", scale: float | None = None, folder: Path | None = None
+) -> Scenario:
+    """Check a scenario given as TOML text; see `load_scenario`.
+
+    ``source`` names it in messages; tables that it names lie in ``folder``, or where the program runs.
+    """
     data = parse_toml(text, source=source, error=ScenarioError, remedy=_REMEDY)
     try:
         file_scale = data.pop("scale", 1.0)
         if not isinstance(file_scale, int | float) or isinstance(file_scale, bool):
             raise ScenarioError(f"`scale` must be a number, got {file_scale!r}")
         _check_start(data.get("simulation"))
+        add_listed(data, folder)
         _fill_heliostats(data)
-        fill_structures(data)
+        fill_structures(data, folder)
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(f"{source}: {in_words(error)}") from error

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, model_validator
 
 from rfpose.errors import ScenarioError
+from rfpose.foreign import beside
 from rfpose.scenario.positions import read_positions
 from rfpose.scenario.records import Identifier, NonNegative, Point, Positive, Record
 
@@ -100,7 +101,7 @@ class Posture(Record):
     """Table of commanded postures; its path from where the command is run."""
 
 
-def fill_structures(data: dict[str, Any]) -> None:
+def fill_structures(data: dict[str, Any], folder: Path | None = None) -> None:
     """Give each plate what ``[site.structures]`` says of all of them, and read its ``csv`` of their places.
 
     The scenario that comes of it holds all plates itself. Rows of the file that the scenario lists by the same name at
@@ -123,7 +124,10 @@ def fill_structures(data: dict[str, Any]) -> None:
     if path is not None:
         if not isinstance(path, str):
             raise ScenarioError(f"`site.structures.csv` must be the path of a file, got {path!r:.80}")
-        plates = table["plate"] = [*plates, *_plates_of(path, [*_tables(data.get("heliostat")), *_tables(plates)])]
+        plates = table["plate"] = [
+            *plates,
+            *_plates_of(beside(path, folder), [*_tables(data.get("heliostat")), *_tables(plates)]),
+        ]
     for plate in plates:
         if isinstance(plate, dict):
             for key, value in common.items():
@@ -134,8 +138,8 @@ def _tables(tables: Any) -> list[dict[str, Any]]:
     return [one for one in tables if isinstance(one, dict)] if isinstance(tables, list) else []
 
 
-def _plates_of(path: str, listed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    ids, pivot = read_positions(Path(path))
+def _plates_of(path: Path, listed: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    ids, pivot = read_positions(path)
     known = {one.get("id"): one.get("pivot_enu_m") for one in listed}
     places: list[list[float]] = pivot.tolist()
     return [

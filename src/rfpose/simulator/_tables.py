@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import RecordingError, ScenarioError
-from rfpose.foreign import read_arrays
+from rfpose.foreign import beside, read_arrays
 from rfpose.scenario import SPEED_OF_LIGHT_MPS, Scenario
 from rfpose.simulator._paths import Paths
 
@@ -184,7 +184,7 @@ class SiteTables:
         if named is None:
             return None
         names = (named,) if isinstance(named, str) else named
-        files = tuple(_located(name, folder) for name in names)
+        files = tuple(beside(name, folder) for name in names)
         columns: list[_Columns] = []
         places = np.empty(position_enu_m.shape)
         tables: dict[Path, RayTable] = {}
@@ -211,12 +211,6 @@ class SiteTables:
         gain.reshape(-1, n_ray)[link, within] = columns.gain
         turns = self._scenario.carrier_rf_hz[:, None] * length / self._scenario.radio.propagation_speed_mps
         return Paths(length_m=length, gain=gain, signal=np.abs(np.sum(gain * np.exp(-2j * np.pi * turns), axis=-1)))
-
-
-def _located(name: str, folder: Path | None) -> Path:
-    """Return the file of a relative name: beside the scenario, else from where the program runs."""
-    beside = Path(name) if folder is None else folder / name
-    return Path(name) if Path(name).exists() and not beside.exists() else beside
 
 
 def _receiver_rows(table: RayTable, scenario: Scenario, position_enu_m: FloatArray, i_frame: int) -> IntArray:

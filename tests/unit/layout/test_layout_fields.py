@@ -26,7 +26,8 @@ def test_csv_columns_in_any_order(tmp_path):
     [
         ("", "empty"),
         ("1.0,2.0\n3,4\n", "not a header"),
-        ("id,east_ft,north_ft\na,1,2\n", "`east_ft` must be `east_m`, in metres"),
+        ("id,east_rod,north_ft\na,1,2\n", "`east_rod` must be `east_m`, in metres"),
+        ("id,east,north\na,1,2\n", "`east` says no unit"),
         ("id,x,y\na,1,2\n", "`east_m` is missing; the header has id, x, y"),
         ("east_m,north_m\n1,two\n", "line 2, `north_m`: 'two' is not a number"),
         ("east_m,north_m\n1,nan\n", "line 2, `north_m` must be finite"),

@@ -27,7 +27,7 @@ from rfpose.measurement import noise_of
 from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.site import check_site_solvable, forecast_normals
-from rfpose.scenario import Scenario, naming, read_positions
+from rfpose.scenario import PositionForm, Scenario, naming, read_positions
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
 
@@ -90,7 +90,7 @@ class Rules:
         heights = (float(transmitter_enu_m[:, 2].min()), float(transmitter_enu_m[:, 2].max()))
         ground = Zone(radius_m=radius)
         if self.outline_csv is not None:
-            ground = Zone(corner_enu_m=read_positions(self.outline_csv)[1][:, :2])
+            ground = Zone(corner_enu_m=read_positions(self.outline_csv, PositionForm(pivot_height_m=0.0))[1][:, :2])
         return Constraints(
             allowed=(ground, *(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.allowed_m)),
             height_m=heights if self.height_m is None else self.height_m,
