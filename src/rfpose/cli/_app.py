@@ -20,6 +20,7 @@ __all__ = ["app"]
 
 COMMANDS = (
     "demo",
+    "init",
     "simulate",
     "info",
     "process",

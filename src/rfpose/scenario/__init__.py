@@ -11,7 +11,7 @@ from rfpose.scenario._scenario import Receiver, Scenario, check_scenario
 from rfpose.scenario.budget import Budget
 from rfpose.scenario.estimation import Integrity, Motion, Plane, Reflection
 from rfpose.scenario.multipath import Antenna, Multipath
-from rfpose.scenario.positions import Columns, PositionForm, read_positions
+from rfpose.scenario.positions import Columns, PositionForm, check_form, read_positions
 from rfpose.scenario.records import (
     ID_PATTERN,
     MAX_FRAME_SAMPLES,
@@ -62,6 +62,7 @@ __all__ = [
     "Structures",
     "Tone",
     "Transmitter",
+    "check_form",
     "check_scenario",
     "load_scenario",
     "naming",

@@ -6,18 +6,20 @@ import csv
 import logging
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.foreign import read_text
+from rfpose.scenario._words import in_words
 from rfpose.scenario.records import ID_PATTERN, MAX_ID_LENGTH, Record
 
-__all__ = ["Columns", "PositionForm", "read_positions"]
+__all__ = ["Columns", "PositionForm", "check_form", "read_positions"]
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +53,20 @@ class PositionForm(Record):
     """Of columns whose headers name none."""
     pivot_height_m: float | None = None
     """Pivots are so far above the table's heights; where it has no heights, so far above zero."""
+
+
+def check_form(data: Mapping[str, Any]) -> PositionForm:
+    """Return a form from plain values.
+
+    Raises
+    ------
+    ScenarioError
+        An unknown key or unit.
+    """
+    try:
+        return PositionForm.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(in_words(error)) from error
 
 
 def read_positions(path: str | Path, form: PositionForm | None = None) -> tuple[tuple[str, ...], FloatArray]:
