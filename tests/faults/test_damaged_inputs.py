@@ -12,7 +12,6 @@ import pytest
 import tomli_w
 
 from damage import as_json, copied, damage_bytes, damage_hdf5, damage_values
-from paint_files import write_json, write_paint
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
 from rfpose.feedback.camera.render import Beam, Target, View, render
 from rfpose.feedback.mount import Mount
@@ -29,6 +28,7 @@ from rfpose.pipeline.formats.track_file import open_track
 from rfpose.pipeline.inspect import inspect_file
 from rfpose.pipeline.pictures.track_view import picture_of_track
 from rfpose.pipeline.process import process
+from rfpose.pipeline.samples.paint import write_json, write_paint
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions

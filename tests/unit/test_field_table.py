@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from paint_files import ORIGIN, write_paint
 from rfpose.errors import ScenarioError
+from rfpose.pipeline.samples.paint import ORIGIN, write_paint
 from rfpose.scenario import load_scenario, parse_scenario, read_positions
 
 TABLE2 = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"

@@ -32,6 +32,8 @@ COMMANDS = (
     "track",
     "convert",
     "view",
+    "sample",
+    "data",
     "bench",
 )
 

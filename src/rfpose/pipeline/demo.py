@@ -15,7 +15,7 @@ from rfpose.files import claim, make_directory, remove
 if TYPE_CHECKING:
     from rfpose.pipeline.evaluate import Evaluation
 
-__all__ = ["STAGES", "DemoOutcome", "run_demo", "shipped_scenario"]
+__all__ = ["STAGES", "DemoOutcome", "run_demo", "shipped_file", "shipped_files", "shipped_scenario"]
 
 STAGES = ("Simulating", "Measuring", "Drawing", "Writing the report")
 
@@ -42,12 +42,31 @@ class DemoOutcome:
 
 def shipped_scenario(name: str) -> Path:
     """Return the path of a scenario that comes with rfpose, from a wheel or from a checkout."""
-    installed = Path(str(resources.files("rfpose"))) / "data" / name
-    checkout = Path(__file__).resolve().parents[3] / "data" / name
-    for path in (installed, checkout):
-        if path.is_file():
-            return path
-    raise RecordingError(f"{installed}: missing from this installation of rfpose; install it again")
+    return shipped_file(name)
+
+
+def shipped_file(name: str) -> Path:
+    """Return the path of a file that comes with rfpose.
+
+    Raises
+    ------
+    RecordingError
+        None is called so, or it is missing from this installation.
+    """
+    known = shipped_files()
+    if name not in known:
+        raise RecordingError(
+            f"{name}: comes not with rfpose, or is missing from this installation; known are "
+            f"{', '.join(known) or 'none: install it again'}"
+        )
+    return known[name]
+
+
+def shipped_files() -> dict[str, Path]:
+    """Return the paths of all files that come with rfpose, by name; from a wheel or from a checkout."""
+    installed = Path(str(resources.files("rfpose"))) / "data"
+    folder = installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "data"
+    return {path.name: path for path in sorted(folder.glob("*")) if path.suffix in (".toml", ".h5")}
 
 
 def run_demo(

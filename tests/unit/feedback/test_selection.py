@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from paint_files import ERRORS, TARGET, tower, wgs84, write_json, write_paint
 from rfpose.cli._app import app
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.calibrated import LEAST_REDUNDANCY, PARAMETER_SETS
@@ -22,6 +21,7 @@ from rfpose.feedback.paint import PaintHeliostat, read_heliostat
 from rfpose.feedback.selection import PLANNED_SIGMA, candidates, fit_chosen
 from rfpose.pipeline.calibrate import calibrate
 from rfpose.pipeline.formats.mount_file import read_models
+from rfpose.pipeline.samples.paint import ERRORS, TARGET, tower, wgs84, write_json, write_paint
 
 EAST, WEST = (20.0, 80.0, 1.5), (-30.0, 60.0, 1.5)
 CREEP_RAD_PER_DAY = 0.05e-3 / 30.4

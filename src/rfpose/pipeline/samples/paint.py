@@ -1,4 +1,4 @@
-"""A small directory in PAINT's layout, made from mounts that are known: for tests that need no real records."""
+"""A small directory in PAINT's layout, made from mounts that are known. No record in it was measured."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from rfpose.feedback.mount import Mount, command
 from rfpose.feedback.paint import read_heliostat
 from rfpose.geometry import enu_from_wgs84
 
+__all__ = ["ERRORS", "FIRST_S", "ORIGIN", "TARGET", "properties", "tower", "wgs84", "write_json", "write_paint"]
+
 ORIGIN = (50.9, 6.4, 90.0)
 TARGET = "tower_target"
 FIRST_S = 1_700_000_000.0
@@ -25,7 +27,7 @@ _METRE_DEG = np.array([1.0 / 111_260.0, 1.0 / 70_300.0, 1.0])
 
 
 def wgs84(enu_m: Any) -> list[float]:
-    """Latitude, longitude, height of a place in the site's frame."""
+    """Return latitude, longitude, height of a place in the site's frame."""
     place = np.array(ORIGIN)
     for _ in range(6):
         place = place + (np.asarray(enu_m) - enu_from_wgs84(place, ORIGIN))[[1, 0, 2]] * _METRE_DEG
@@ -41,7 +43,7 @@ def _actuator(clockwise: int, angle: float) -> dict[str, Any]:
 
 
 def properties(position_enu_m: Any) -> dict[str, Any]:
-    """What PAINT says of a heliostat."""
+    """Return what PAINT says of a heliostat."""
     return {
         "heliostat_position": wgs84(position_enu_m),
         "initial_orientation": [0.0, -1.0, 0.0],
@@ -54,11 +56,11 @@ def properties(position_enu_m: Any) -> dict[str, Any]:
 
 
 def tower() -> dict[str, Any]:
-    """What PAINT says of the tower: one target that faces north."""
+    """Return what PAINT says of the tower: one target that faces north."""
     corners = {"upper_left": (4.0, 3.5), "upper_right": (-4.0, 3.5), "lower_left": (4.0, -3.5), "lower_right": (-4, -3)}
     places = {name: wgs84([east, 0.0, 36.0 + up]) for name, (east, up) in corners.items()}
     return {
-        "power_plant_properties": {"ID": "test", "coordinates": list(ORIGIN)},
+        "power_plant_properties": {"ID": "synthetic", "coordinates": list(ORIGIN)},
         TARGET: {
             "type": "planar", "normal_vector": [0, 1, 0],
             "coordinates": {"center": wgs84([0.0, 0.0, 36.0]), **places},
@@ -80,6 +82,7 @@ def write_paint(
     creep_rad_per_day: float = 0.0,
     every_days: float = 11.0,
     sigma_rad: float = 3e-4,
+    seed: int = 0,
 ) -> Path:
     """Write heliostats (place by name) whose mounts err by `ERRORS` and, if wanted, creep; return the folder."""
     write_json(folder / "tower" / "tower_measurements.json", tower())
@@ -92,7 +95,7 @@ def write_paint(
         )
         planned = read_heliostat(folder, name).mount
         (records / "1_calibration_properties.json").unlink()
-        rng = np.random.default_rng(h)
+        rng = np.random.default_rng(seed + h)
         for i in range(n_record):
             day = every_days * i
             mount = planned.replace(**ERRORS | {"axis_1_zero_rad": ERRORS["axis_1_zero_rad"] + creep_rad_per_day * day})
