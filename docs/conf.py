@@ -1,15 +1,9 @@
 """How `scripts/docs` builds the site: pages in Markdown, reference from docstrings, tutorials as a gallery."""
 
-import sys
-from pathlib import Path
-
 from matplotlib.figure import Figure
 from sphinx_gallery.scrapers import figure_rst
 
 import rfpose
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "tests"))  # where the maker of synthetic PAINT records is
 
 
 def figures(block, block_vars, gallery_conf):

@@ -6,17 +6,15 @@ PAINT is the open data base of the heliostats of Jülich: motor positions, sun a
 calibrations. From such records comes a kinematic model of each heliostat, and how far to trust it.
 
 **The records of this page are synthetic**: made in PAINT's layout from mounts whose errors are known, by
-``tests/paint_files.py`` of a checkout of rfpose (``PYTHONPATH=tests``). Real ones are fitted in the same way,
-``rf.calibrate("paint/")``.
+what ``rfpose sample paint`` makes them with. Real ones are fitted in the same way, ``rf.calibrate("paint/")``.
 """
 
 # %%
 import tempfile
 from pathlib import Path
 
-from paint_files import ERRORS, write_paint
-
 import rfpose as rf
+from rfpose.pipeline.samples.paint import ERRORS, write_paint
 
 folder = Path(tempfile.mkdtemp()) / "paint"
 write_paint(folder, {"AA23": (-20.0, 60.0, 0.0), "AB41": (35.0, 90.0, 0.0)}, n_record=40)

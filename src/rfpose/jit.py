@@ -20,6 +20,7 @@ from typing import Any
 
 __all__ = [
     "Kernel",
+    "compilations",
     "kernel",
     "kernel_fast",
     "kernel_inline",
@@ -209,14 +210,18 @@ class _Teller:
 
     def __init__(self) -> None:
         self.can_keep = True
+        self.count = 0
         self._told = False
 
     def hear(self, module: str) -> None:
         """Take note that a function of a module is about to be compiled."""
-        if self._told or not module.startswith("rfpose."):
+        if not module.startswith("rfpose."):
+            return
+        self.count += 1
+        if self._told:
             return
         self._told = True
-        _log.info("compiling kernels, once; this takes up to a minute or two")
+        _log.info("compiling kernels, once; this takes up to a minute or two (`rfpose warm-up` compiles all of them)")
         if not self.can_keep:
             _log.info(
                 "they cannot be kept, since neither the directory of rfpose nor that of the user can be written; set "
@@ -225,3 +230,8 @@ class _Teller:
 
 
 _teller = _Teller()
+
+
+def compilations() -> int:
+    """Return how many kernels this process has compiled; what comes out of the cache is none."""
+    return _teller.count

@@ -164,7 +164,7 @@ def _words() -> list[str]:
     """Every command as typed; a group's sub-commands instead of the group."""
     out = []
     for name in _app.COMMANDS:
-        command = importlib.import_module(f"rfpose.cli.{name}").command
+        command = importlib.import_module(f"rfpose.cli.{name.replace('-', '_')}").command
         out += [f"{name} {sub}" for sub in command.commands] if isinstance(command, click.Group) else [name]
     return out
 
@@ -180,7 +180,7 @@ def test_each_command_has_help_with_examples(name: str) -> None:
 
 @pytest.mark.parametrize("name", _app.COMMANDS)
 def test_command_is_called_as_its_module(name: str) -> None:
-    command = importlib.import_module(f"rfpose.cli.{name}").command
+    command = importlib.import_module(f"rfpose.cli.{name.replace('-', '_')}").command
     assert isinstance(command, click.Command)
     assert command.name == name
 

@@ -34,6 +34,7 @@ COMMANDS = (
     "view",
     "sample",
     "data",
+    "warm-up",
     "bench",
 )
 
@@ -51,7 +52,7 @@ class _LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command: click.Command = importlib.import_module(f"rfpose.cli.{cmd_name}").command
+        command: click.Command = importlib.import_module(f"rfpose.cli.{cmd_name.replace('-', '_')}").command
         return command
 
     def make_context(self, *args: Any, **settings: Any) -> click.Context:

@@ -1,0 +1,130 @@
+"""Compile every kernel once, by doing each of rfpose's jobs on a field so small that only compiling takes time."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rfpose.jit import compilations
+from rfpose.pipeline.demo import shipped_scenario
+from rfpose.scenario import Scenario, load_scenario
+
+__all__ = ["JOBS", "WarmUp", "warm_up"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WarmUp:
+    """What compiling took.
+
+    Attributes
+    ----------
+    compiled
+        Kernels that were compiled; those that were before came from the cache.
+    seconds
+        Of all jobs [s].
+    """
+
+    compiled: int
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return both, with stable keys."""
+        return {"compiled": self.compiled, "seconds": self.seconds}
+
+
+def warm_up(*, on_progress: Callable[[int, int], None] | None = None) -> WarmUp:
+    """Do each of `JOBS` once, so that no later one has to compile.
+
+    Parameters
+    ----------
+    on_progress
+        Called with jobs done and in all.
+
+    Returns
+    -------
+    WarmUp
+    """
+    begun, before = time.monotonic(), compilations()
+    site = _small_site()
+    with tempfile.TemporaryDirectory(prefix="rfpose-warm-up-") as folder:
+        for done, job in enumerate(JOBS):
+            if on_progress is not None:
+                on_progress(done, len(JOBS))
+            job(site, Path(folder))
+    return WarmUp(compiled=compilations() - before, seconds=time.monotonic() - begun)
+
+
+def _small_site() -> Scenario:
+    site = load_scenario(shipped_scenario("table2_100m.toml"))
+    return site.changed(
+        heliostat=site.heliostat[:2],
+        radio={"frame_samples": 8000},
+        simulation={"frame_count": 2, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0},
+    )
+
+
+def _simulate_and_measure(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.evaluate import evaluate
+    from rfpose.pipeline.process import process
+    from rfpose.pipeline.simulate import simulate
+
+    simulate(site, seed=1).save(folder / "recording.h5")
+    for k, estimator in enumerate(("hilbert", "correlator")):
+        for pose in ("rigid", "independent"):
+            result = process(folder / "recording.h5", folder / f"{k}_{pose}.h5", estimator=estimator, pose=pose)
+    evaluate(result)
+
+
+def _reflection_and_filter(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.process import process
+    from rfpose.pipeline.simulate import simulate
+
+    ground = site.changed(simulation={"ground": {"coefficient": (-0.3, 0.1)}})
+    process(simulate(ground, seed=1), estimator="correlator", reflection="estimate", filtered=True)
+
+
+def _pose_site(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.process import process
+    from rfpose.pipeline.simulate import simulate
+
+    plates = site.changed(heliostat={"width_m": 2.0, "height_m": 2.0, "pivot_sigma_m": 0.01})
+    process(simulate(plates, seed=1), estimator="correlator", pose="site")
+
+
+def _layouts(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.layout import budget, layout_map, optimise
+
+    layout_map(site, sensitivity=True)
+    budget(site, n_draw=2)
+    optimise(site, starts=1)
+
+
+def _tracking(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.track import track
+
+    plan = load_scenario(shipped_scenario("tracking_100m.toml"))
+    plan = plan.changed(heliostat=plan.heliostat[:2], tracking={"first_hour": 11.9, "last_hour": 12.0})
+    track(plan, folder / "day.h5")
+
+
+def _calibration(site: Scenario, folder: Path) -> None:
+    from rfpose.pipeline.calibrate import calibrate
+    from rfpose.pipeline.samples import write_sample
+
+    write_sample("drone", folder / "flight")
+    calibrate(mounts=folder / "flight" / "planned.toml", drone=folder / "flight" / "flight.csv")
+
+
+JOBS: tuple[Callable[[Scenario, Path], None], ...] = (
+    _simulate_and_measure,
+    _reflection_and_filter,
+    _pose_site,
+    _layouts,
+    _tracking,
+    _calibration,
+)
+"""What is done; each is given a small site and a folder for its files."""

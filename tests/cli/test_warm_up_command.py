@@ -1,0 +1,48 @@
+"""``rfpose warm-up``: after it, what was compiled is not compiled again."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+from click.testing import CliRunner
+
+from rfpose.cli._app import app
+from rfpose.jit import compilations, kernel
+
+SECOND = """
+import json, sys
+import rfpose as rf
+from rfpose.jit import compilations
+site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+small = site.changed(heliostat=site.heliostat[:3], radio={"frame_samples": 16000}, simulation={"frame_count": 1})
+rf.process(rf.simulate(small, seed=3), estimator="correlator")
+rf.layout_map(small)
+print(compilations())
+"""
+
+
+@kernel
+def _added(x):
+    return x + 1.0
+
+
+def test_compilations_are_counted():
+    _added.py_func.__module__ = "rfpose.here"
+    before = compilations()
+    _added(2.0)
+    assert compilations() == before + 1
+    _added(3.0)
+    assert compilations() == before + 1
+    _added(np.float32(3.0))
+    assert compilations() == before + 2
+
+
+def test_what_is_warm_compiles_nothing():
+    done = CliRunner().invoke(app, ["warm-up", "--json"])
+    assert done.exit_code == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert set(told) == {"compiled", "seconds"}
+    later = subprocess.run([sys.executable, "-c", SECOND], capture_output=True, text=True, check=True, env=os.environ)
+    assert later.stdout.strip() == "0"
