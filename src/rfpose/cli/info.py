@@ -8,7 +8,19 @@ from typing import Any
 
 import click
 
-from rfpose.cli._support import check_there, common_options, emit_json, examples, follow_links_option, say, wants_json
+from rfpose.cli._support import (
+    check_ending,
+    check_there,
+    common_options,
+    emit_json,
+    examples,
+    follow_links_option,
+    force_option,
+    outputs,
+    say,
+    wants_json,
+)
+from rfpose.errors import InvalidInputError
 
 __all__ = ["command"]
 
@@ -19,23 +31,52 @@ __all__ = ["command"]
         "rfpose info recording.h5",
         "rfpose info result.h5 --json",
         "rfpose info site.toml",
+        "rfpose info site.toml --picture site.png",
         "rfpose info models.json",
         "rfpose info day.h5",
     ),
 )
 @click.argument("file", type=click.Path(path_type=Path))
+@click.option("--picture", type=click.Path(path_type=Path), help="Draw a scenario's site: .png, .svg, .pdf.")
 @follow_links_option
+@force_option
 @common_options
-def command(file: Path, follow_links: bool) -> None:
-    """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound."""
+def command(file: Path, picture: Path | None, follow_links: bool, force: bool) -> None:
+    """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound.
+
+    Of a scenario also draw the site, in letters or with --picture.
+    """
+    check_ending(picture, ".png", ".svg", ".pdf")
     check_there(file)
     from rfpose.pipeline.inspect import inspect_file
 
     found = inspect_file(file, follow_links=follow_links)
+    is_site = found["kind"] == "scenario"
+    if picture is not None:
+        if not is_site:
+            raise InvalidInputError(f"`picture` draws a scenario's site, and {file} is none; `rfpose view` draws it")
+        _draw(file, picture, force)
     if wants_json():
-        emit_json(found)
+        emit_json(found if picture is None else {**found, "picture": picture})
         return
     _print(found, indent=0)
+    if is_site and picture is None:
+        from rfpose.pipeline.pictures.site import plan_in_letters
+        from rfpose.scenario import load_scenario
+
+        for line in ("", *plan_in_letters(load_scenario(file))):
+            say(line)
+    if picture is not None:
+        say(f"wrote {picture}")
+
+
+def _draw(file: Path, picture: Path, force: bool) -> None:
+    with outputs(picture, inputs=[file], force=force):
+        from rfpose.drawing import save_figure
+        from rfpose.pipeline.pictures.site import site_plan
+        from rfpose.scenario import load_scenario
+
+        save_figure(site_plan(load_scenario(file)), picture)
 
 
 def _print(data: Mapping[str, Any], *, indent: int) -> None:

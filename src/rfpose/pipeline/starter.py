@@ -64,7 +64,7 @@ class Starter:
     aim_enu_m
         None: a height that suits the field, marked as to be changed.
     radius_m
-        Of the transmitters' ring [m]; None: about the mirrors.
+        Of the transmitters' ring about the origin [m]; None: it goes about the mirrors.
     dishes
         Whether they are dishes, which face the sun.
     """
@@ -223,7 +223,7 @@ def _north_of_tower() -> FloatArray:
 def _toml(starter: Starter) -> str:
     place = np.asarray(starter.pivot_enu_m)
     low, high = place[:, :2].min(axis=0), place[:, :2].max(axis=0)
-    centre = np.zeros(2) if not starter.table else np.round(0.5 * (low + high))
+    centre = np.zeros(2) if starter.radius_m else np.round(0.5 * (low + high))
     reach = 1.1 * float(np.linalg.norm(place[:, :2] - centre, axis=1).max())
     radius = starter.radius_m or float(f"{max(_LEAST_RADIUS_M, reach):.2g}")
     # a field of kilometres has no masts that are half as high

@@ -1,0 +1,117 @@
+"""Plans of a site: what stands where, seen from above, as a figure and in letters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rfpose.checks import FloatArray
+from rfpose.drawing import mark_places, new_figure
+from rfpose.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["plan_in_letters", "site_plan"]
+
+_NAMED = 40
+"""Up to so many mirrors are named."""
+_ARROW = 0.06
+"""Length of an arrow along a normal, of the plan's width."""
+
+
+def site_plan(scenario: Scenario) -> Figure:
+    """Draw a scenario's site from above: mirrors with where they face, transmitters, receivers, structures, aim point.
+
+    Parameters
+    ----------
+    scenario
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from matplotlib.patches import Polygon
+
+    figure, axes = new_figure(8.4, 7.2)
+    for k, box in enumerate(scenario.site.structures.box):
+        half = 0.5 * np.array(box.size_m[:2]) * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        sine, cosine = np.sin(np.radians(box.azimuth_deg)), np.cos(np.radians(box.azimuth_deg))
+        corners = np.array(box.base_enu_m[:2]) + half @ np.array([[cosine, -sine], [sine, cosine]])
+        axes.add_patch(Polygon(corners, color="0.75", zorder=1, label="box" if k == 0 else None))
+    pivot, normal = scenario.pivot_enu_m, scenario.posture_enu
+    size = float(np.clip(4000.0 / max(len(pivot), 1), 6.0, 70.0))
+    plates = np.array([p.pivot_enu_m for p in scenario.site.structures.plate]).reshape(-1, 3)
+    if len(plates):
+        axes.scatter(
+            plates[:, 0], plates[:, 1], s=size, marker="s", facecolor="none", edgecolor="0.5", label="without receivers"
+        )
+    axes.scatter(pivot[:, 0], pivot[:, 1], s=size, color="#0072B2", zorder=2, label="heliostat")
+    faces = np.isfinite(normal).all(axis=1)
+    if faces.any():
+        width = _ARROW * float(np.ptp(_places(scenario)[:, :2], axis=0).max())
+        axes.quiver(
+            *pivot[faces, :2].T, *(width * normal[faces, :2]).T, angles="xy", scale_units="xy", scale=1.0,
+            color="#0072B2", width=0.003, zorder=2,
+        )  # fmt: skip
+    if len(pivot) <= _NAMED:
+        for name, place in zip(scenario.heliostat_ids, pivot, strict=True):
+            axes.annotate(name, place[:2], (5, 4), textcoords="offset points", fontsize=7, color="#004B75")
+    mark_places(axes, scenario.transmitter_enu_m, scenario.transmitter_ids, marker="^", label="transmitter")
+    if scenario.calibration_receiver:
+        names = tuple(receiver.id for receiver in scenario.calibration_receiver)
+        mark_places(axes, scenario.calibration_enu_m, names, marker="s", label="calibration receiver")
+    if scenario.site.aim_enu_m is not None:
+        axes.scatter(*scenario.site.aim_enu_m[:2], marker="*", s=140, color="#E69F00", zorder=4, label="aim point")
+    axes.set_xlabel("east [m]")
+    axes.set_ylabel("north [m]")
+    axes.set_aspect("equal")
+    axes.grid(alpha=0.3)
+    axes.set_title(scenario.name + (" (arrows: where mirrors face, from above)" if faces.any() else ""))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    return figure
+
+
+def plan_in_letters(scenario: Scenario, *, width: int = 64) -> list[str]:
+    """Return a plan of the site in letters, north up: what stands in the same place hides what comes before it here.
+
+    ``o`` heliostats, ``p`` plates without receivers, ``C`` calibration receivers, ``*`` aim point, ``T`` transmitters.
+
+    Parameters
+    ----------
+    scenario
+    width
+        Letters in a line; a line is as high as two letters are wide.
+    """
+    places = _places(scenario)
+    if not len(places):
+        return []
+    low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+    step = max(float((high - low)[0]), 2.0 * float((high - low)[1]) / 3.0, 1e-6) / (width - 1)
+    grid = np.full((round(float((high - low)[1]) / (2.0 * step)) + 1, width), " ", dtype="<U1")
+    for letter, some in _groups(scenario):
+        column = np.rint((some[:, 0] - low[0]) / step).astype(np.int64)
+        row = np.rint((high[1] - some[:, 1]) / (2.0 * step)).astype(np.int64)
+        grid[row, column] = letter
+    return ["".join(row).rstrip() for row in grid] + [
+        f"{' ' * 4}o heliostat, T transmitter, C calibration receiver, * aim point, p plate; north up, "
+        f"a letter is {step:.2g} m wide"
+    ]
+
+
+def _groups(scenario: Scenario) -> list[tuple[str, FloatArray]]:
+    aim = [] if scenario.site.aim_enu_m is None else [scenario.site.aim_enu_m]
+    plates = [p.pivot_enu_m for p in scenario.site.structures.plate]
+    groups = (
+        ("p", plates),
+        ("o", scenario.pivot_enu_m),
+        ("C", scenario.calibration_enu_m),
+        ("*", aim),
+        ("T", scenario.transmitter_enu_m),
+    )
+    return [(letter, np.array(places, np.float64).reshape(-1, 3)) for letter, places in groups]
+
+
+def _places(scenario: Scenario) -> FloatArray:
+    return np.concatenate([places for _, places in _groups(scenario)])
