@@ -25,5 +25,18 @@ class GeometryError(RfposeError, ValueError):
 
 
 def install_remedy(extra: str) -> str:
-    """Return how to install an extra, in words that hold in a checkout and for an installed rfpose alike."""
-    return f"in a checkout of rfpose: `pip install '.[{extra}]'`; else: `pip install 'rfpose[{extra}]'`"
+    """Return how to install what an extra needs, by the names of its packages.
+
+    That holds whether rfpose is on an index or not, came from a wheel or is a checkout: of rfpose itself nothing is
+    fetched, and what another project of that name may be is never asked for.
+    """
+    import re
+    from importlib import metadata
+
+    try:
+        wanted = metadata.requires("rfpose") or []
+    except metadata.PackageNotFoundError:  # run from a folder, not installed
+        return f"in the folder of rfpose: `pip install '.[{extra}]'`"
+    found = [re.match(rf"([^;]+?)\s*;.*extra == ['\"]{re.escape(extra)}['\"]", line) for line in wanted]
+    names = [f"'{match[1]}'" for match in found if match is not None]
+    return f"`pip install {' '.join(names)}`" if names else f"in the folder of rfpose: `pip install '.[{extra}]'`"

@@ -1,6 +1,7 @@
 """Each command that is given another kind of file says what it is and which command takes it; info knows them all."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -134,7 +135,13 @@ def test_tones_speak_in_the_unit_that_was_asked_for(files: dict[str, Path]) -> N
 
 
 def test_extras_are_installed_from_a_checkout_too() -> None:
-    assert install_remedy("gui") == "in a checkout of rfpose: `pip install '.[gui]'`; else: `pip install 'rfpose[gui]'`"
+    """The packages themselves: rfpose need not be on any index, nor be a checkout."""
+    told = install_remedy("gui")
+    assert re.fullmatch(
+        r"`pip install 'pyqtgraph>=[\d.]+' 'pyside6-essentials[^']+'`", told.replace("PySide6-E", "pyside6-e")
+    )
+    assert "6.12.0" in told
+    assert "'scikit-image>=" in install_remedy("images")
     for path in (DATA.parent / "src").rglob("*.py"):
         if path.name != "errors.py":
             assert "rfpose[" not in path.read_text(encoding="utf-8"), f"{path}: use install_remedy"

@@ -125,7 +125,7 @@ def test_pictures_from_files(tmp_path):
 
 def test_without_scikit_image(monkeypatch):
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'rfpose\[images\]'"):
+    with pytest.raises(InvalidInputError, match="pip install 'scikit-image>="):
         find_spot(picture((0.0, 0.0)))
 
 
