@@ -53,7 +53,7 @@ from rfpose.pipeline.solve import solve
 from rfpose.propagation import RayKind
 from rfpose.scenario import Scenario
 
-__all__ = ["Case", "Folders", "cases"]
+__all__ = ["Case", "Folders", "Spec", "case_of", "cases", "posture_table", "specs", "told_normals"]
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -139,7 +139,8 @@ class Spec:
     today: str = ""
 
 
-def _specs() -> Iterator[Spec]:
+def specs() -> Iterator[Spec]:
+    """Yield the rows of the table."""
     for place, factor in (("beside", 1.0), ("front", 2.0)):
         yield Spec(
             name=f"tower, neighbours, no ground; {place}", place=place, variant="field", drop="ground", ground=None,
@@ -242,7 +243,7 @@ def cases(folder: str | Path, *, own: str | Path | None = None, patterns: str | 
         own=None if own is None else Path(own),
         patterns=None if patterns is None else Path(patterns),
     )
-    found = [case_of(spec, folders) for spec in _specs()]
+    found = [case_of(spec, folders) for spec in specs()]
     return [case for case in found if not isinstance(case, str)]
 
 
@@ -274,7 +275,7 @@ def case_of(spec: Spec, folders: Folders, suns: Sequence[int] = SUNS) -> Case | 
     commanded = _tilted(normal, off, rng)
     return Case(
         spec=spec,
-        scenario=told.changed(posture={"csv": str(_posture_table(truth, commanded))}),
+        scenario=told.changed(posture={"csv": str(posture_table(truth, commanded))}),
         tones=tones,
         normal_true_enu=normal[:, :n_heliostat],
         normal_commanded_enu=commanded[:, :n_heliostat],
@@ -395,7 +396,12 @@ _TRACED: dict[str, dict[str, Any]] = {
 _SCRATCH = tempfile.TemporaryDirectory(prefix="rfpose-real-field-")
 
 
-def _posture_table(site: Scenario, normal: Array) -> Path:
+def told_normals(case: Case) -> Array:
+    """Return where all mirrors of a case were told to point (frame, mirror, xyz), neighbours last."""
+    return commanded_normals(case.scenario, np.full(len(case.normal_true_enu), np.nan))
+
+
+def posture_table(site: Scenario, normal: Array) -> Path:
     """Write where mirrors were told to point (frame, mirror, xyz), as ``[posture] csv`` has it."""
     names = [mirror.id for mirror in (*site.heliostat, *site.site.structures.plate)]
     lines = ["id,frame,normal_e,normal_n,normal_u"]
@@ -611,7 +617,7 @@ def main() -> None:
     if not options.json:
         print("| case | solved | rms / median / max mrad | NEES | within 3 sigma | silent | target | met | before |")
         print("|---|---|---|---|---|---|---|---|---|", flush=True)
-    for spec in _specs():
+    for spec in specs():
         if re.search(options.case, spec.name) is None:
             continue
         case = case_of(spec, folders)

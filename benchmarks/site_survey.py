@@ -1,23 +1,40 @@
-"""What a survey by radio makes of receivers that are 1 mm off: errors of normals before and after, no multipath.
+"""What a survey by radio makes of receivers that are 1 mm off, and of mounts in a real field.
 
     python benchmarks/site_survey.py
+    python benchmarks/site_survey.py --traced ../shared/data/traced --tables TABLES --patterns PATTERNS
 
-Five heliostats of table2_100m.toml at 433 MHz, pivots known to 3 mm, 12 postures of a day, receivers off by 1 mm in
-each axis; a camera measures every second posture to 0.1 mrad.
+Without tables there is no multipath: five heliostats of table2_100m.toml at 433 MHz, pivots known to 3 mm, 12 postures
+of a day, receivers off by 1 mm in each axis; a camera measures every second posture to 0.1 mrad. Errors of normals
+before and after.
+
+With tables (`benchmarks/real_field.py` says what they are; ``open_433MHz_sun0`` and on, a posture each) eight mirrors
+stand in the traced field with all that it has: ground, tower, neighbours, the own plate by moments, its pattern given.
+Their mounts lean by 3 mrad, have zeros that are 8 mrad off and axes 1 mrad out of square; control knows nothing of it.
+What a survey of the first so many postures finds of that is held against the truth, its covariance with it; "white"
+takes frames for independent, as they are not.
 """
 
+import argparse
+import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import rfpose as rf
+from rfpose.feedback.correlated import AXES_AND_ZEROS, fit_correlated
+from rfpose.feedback.mount import Mount, command, posture
+from rfpose.feedback.selection import PLANNED_SIGMA
 from rfpose.geometry import unit
+from rfpose.multilat.site import PostureCorrelation
 
 SEED = 4
 N_HELIOSTAT = 5
 CAMERA_RAD = 1e-4
+MOUNT_SIGMA = dict(zip(AXES_AND_ZEROS, (3e-3, 3e-3, 8e-3, 8e-3, 1e-3), strict=True))
+POSTURES = (5, 10, 20)
 
 
 def sites():
@@ -46,8 +63,8 @@ def show(name, result):
     print(f"{name:40s} {error:8.4f} {1e3 * np.sqrt(np.nanmean(result.poses.sigma_rad**2)):8.4f}")
 
 
-def main():
-    """Print the table."""
+def without_multipath():
+    """Print the table of places."""
     known, built, rng = sites()
     recording = rf.simulate(built, seed=2)
     truth = recording.truth
@@ -67,10 +84,123 @@ def main():
             found = rf.survey([recording], path, scenario=known, reference=reference, force=True)
             took = time.perf_counter() - begin
             show(name, rf.process(recording, scenario=known, pose="site", survey=path))
-            print(
-                f"  {took:.0f} s; {known.heliostat_ids[0]}: {found.as_dict()['heliostats']['H01']['normal_sigma_mrad']}"
-            )
+            report = found.as_dict()["heliostats"]["H01"]
+            print(f"  {took:.0f} s; {known.heliostat_ids[0]}: {report['normal_sigma_mrad']}")
+            print(f"  mount: {report['mount']['normal_sigma_mrad']}, scatter {report['mount']['scatter']:.2f}")
             print(f"  not determined: {'; '.join(found.undetermined[0])}")
+
+
+# -- mounts in the traced field ------------------------------------------------------------------------------
+
+
+def true_mounts(site):
+    """Return mounts as they are, and as control believes them to be."""
+    rng = np.random.default_rng([SEED, 1])
+    planned = [Mount(pivot_enu_m=np.array(h.pivot_enu_m)) for h in site.heliostat]
+    off = [{name: sigma * float(rng.standard_normal()) for name, sigma in MOUNT_SIGMA.items()} for _ in planned]
+    return [mount.replace(**values) for mount, values in zip(planned, off, strict=True)], planned
+
+
+def traced_case(folders, spec, suns):
+    """Return a case whose mirrors were told by control, which knows no error of their mounts, and those mounts."""
+    import real_field
+
+    case = real_field.case_of(spec, folders, suns)
+    if isinstance(case, str):
+        sys.exit(f"{folders.own}: {case}; trace it with benchmarks/real_field_tables.py")
+    mounts, planned = true_mounts(case.scenario)
+    told = real_field.told_normals(case)
+    for i, (true, believed) in enumerate(zip(mounts, planned, strict=True)):
+        count = command(true, sun_enu=case.normal_true_enu[:, i], mode="dish").count
+        told[:, i] = posture(believed, count).normal_enu
+    csv = real_field.posture_table(case.scenario, told)
+    return replace(case, scenario=case.scenario.changed(posture={"csv": str(csv)})), mounts
+
+
+class Judged:
+    """What surveys found of mounts, against the truth."""
+
+    def __init__(self):
+        self.error, self.cov, self.normal, self.normal_sigma = [], [], [], []
+
+    def take(self, parameter, cov, true, normal_true, normal_sigma):
+        """Take one mirror: its parameters, their covariance, the mount as it is, postures to be held against."""
+        self.error.append(parameter - np.array([true.parameters[name] for name in AXES_AND_ZEROS]))
+        self.cov.append(cov)
+        found = true.replace(**dict(zip(AXES_AND_ZEROS, parameter.tolist(), strict=True)))
+        count = command(true, sun_enu=normal_true, mode="dish").count
+        self.normal.append(posture(found, count).normal_enu - normal_true)
+        self.normal_sigma.append(normal_sigma)
+
+    def row(self):
+        """Return rms of normals and what was stated, NEES of parameters, and their rms."""
+        error = np.array(self.error)
+        nees = np.einsum("mp,mpq,mq->", error, np.linalg.inv(np.array(self.cov)), error) / error.size
+        normal = np.sqrt(np.mean(np.sum(np.array(self.normal) ** 2, axis=-1)))
+        stated = np.sqrt(np.mean(np.square(self.normal_sigma)))
+        return 1e3 * normal, 1e3 * stated, nees, 1e3 * np.sqrt(np.mean(error**2, axis=0))
+
+
+def in_the_field(options):
+    """Print the table of mounts."""
+    import real_field
+
+    from rfpose.pipeline.postures import commanded_normals
+    from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts
+    from rfpose.pipeline.survey import Besides, Frames, survey_frames
+
+    folders = real_field.Folders(given=options.traced, own=options.tables, patterns=options.patterns)
+    suns = [sun for sun in range(40) if folders.table("open", 433.0, sun) is not None]
+    spec = next(
+        s for s in real_field.specs() if s.name == f"everything, 433 MHz, pattern {options.told}; {options.place}"
+    )
+    case, mounts = traced_case(folders, spec, suns)
+    print(f"{len(suns)} suns; {options.place}, pattern {options.told}")
+    print(
+        "| postures | worth | falls to 1/e over | rms of a mount's normal, stated [mrad] | NEES | white | tilts, zeros, square rms [mrad] |"
+    )
+    print("|---|---|---|---|---|---|---|", flush=True)
+    for n in options.postures:
+        if n > len(suns):
+            print(f"| {n} | no so many tables |")
+            continue
+        tones, site = case.tones, case.scenario
+        frames = Frames(carrier=tones.carrier[:n], sigma=tones.carrier_sigma[:n], unix_s=np.full(n, np.nan))
+        begin = time.perf_counter()
+        found = survey_frames([frames], site, Besides(mounts=planned_mounts(site, None)))
+        took = time.perf_counter() - begin
+        judged = Judged()
+        for i, true in enumerate(mounts):
+            judged.take(
+                found.mounts.parameter[i],
+                found.mounts.cov[i],
+                true,
+                case.normal_true_enu[:, i],
+                found.mounts.normal_sigma_rad[i, 1],
+            )
+        rms, stated, nees, each = judged.row()
+        angle = np.degrees(found.correlation_rad[0])
+        print(
+            f"| {n} | {found.frame_worth.mean():.1f} | {angle:.1f}° x {found.correlation_share[0]:.2f} | {rms:.2f}, {stated:.2f} "
+            f"| {nees:.2f} | | {', '.join(f'{x:.2f}' for x in each)} | {took:.0f} s; scatter {np.round(found.mounts.scatter, 2)}",
+            flush=True,
+        )
+
+
+def main():
+    """Print the tables asked for."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--traced", type=Path, help="../shared/data/traced: mounts in the traced field")
+    parser.add_argument("--tables", type=Path, help="ray tables of one's own")
+    parser.add_argument("--patterns", type=Path, help="antenna patterns")
+    parser.add_argument("--place", choices=("beside", "front"), default="beside")
+    parser.add_argument("--told", choices=("given", "learned", "none", "other mesh"), default="given")
+    parser.add_argument("--postures", type=int, nargs="*", default=POSTURES)
+    options = parser.parse_args()
+    if options.traced is None:
+        without_multipath()
+    else:
+        in_the_field(options)
 
 
 if __name__ == "__main__":

@@ -47,6 +47,16 @@ __all__ = ["command"]
     show_default=True,
     help="How good they are, in each of two directions [mrad].",
 )
+@click.option(
+    "--mount",
+    type=click.Path(path_type=Path),
+    help="Mounts that control believed in (JSON or TOML); without it azimuth over elevation.",
+)
+@click.option(
+    "--motors",
+    type=click.Path(path_type=Path),
+    help="CSV of motor positions: time_utc, heliostat, axis_1, axis_2; without it motors stood as commanded.",
+)
 @follow_links_option
 @force_option
 @common_options
@@ -56,21 +66,28 @@ def command(
     scenario: Path | None,
     reference: Path | None,
     reference_sigma: float,
+    mount: Path | None,
+    motors: Path | None,
     follow_links: bool,
     force: bool,
 ) -> None:
-    """Find what does not change over many postures: places of receivers, pivots, transmitters.
+    """Find what does not change over many postures: places of receivers, pivots, transmitters, mounts.
 
     Says what the postures do not tell: how the receivers are turned against the plate, above all, which radio alone
     never tells.
     """
-    with outputs(output, inputs=[*recordings, scenario, reference], force=force), progress("Surveying") as on_progress:
+    with (
+        outputs(output, inputs=[*recordings, scenario, reference, mount, motors], force=force),
+        progress("Surveying") as on_progress,
+    ):
         found = rfpose.survey(
             recordings,
             output,
             scenario=scenario,
             reference=reference,
             reference_sigma_rad=1e-3 * reference_sigma,
+            mounts=mount,
+            motors=motors,
             follow_links=follow_links,
             force=force,
             on_progress=on_progress,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rfpose.checks import as_float_array, as_positive
+from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.camera.malan import Board, find_spot
 from rfpose.feedback.camera.model import spot_sigma_rad, spots_enu_m
@@ -34,7 +34,7 @@ from rfpose.sun import Site, sun_position, unix_seconds
 if TYPE_CHECKING:
     from rfpose.pipeline.formats.result import Result
 
-__all__ = ["Gathered", "read_camera", "read_drone", "read_paint", "read_radio"]
+__all__ = ["Gathered", "MotorLog", "read_camera", "read_drone", "read_paint", "read_radio"]
 
 BOARD_NAME, PICTURES_NAME = "board.toml", "pictures.csv"
 _SPOT_SIGMA_M = 0.01
@@ -65,6 +65,36 @@ class Gathered:
     failed: Mapping[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotorLog:
+    """Where motors stood.
+
+    Attributes
+    ----------
+    entries
+        By heliostat's name (entry, 3): time [s since 1970 UTC] and the positions of axis 1 and axis 2, in the course of
+        time.
+    """
+
+    entries: Mapping[str, FloatArray]
+
+    @classmethod
+    def read(cls, path: Path) -> MotorLog:
+        """Read a CSV file with the columns time_utc, heliostat, axis_1, axis_2."""
+        log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
+        for row in _rows(path, ("time_utc", "heliostat", "axis_1", "axis_2")):
+            log[row.text["heliostat"]].append((row.unix_s, row.number("axis_1"), row.number("axis_2")))
+        return cls(entries={name: np.array(sorted(entries)) for name, entries in log.items()})
+
+    def count(self, name: str, unix_s: float, *, within_s: float = 1.0) -> tuple[float, float] | None:
+        """Return the positions nearest to a time; None where none was logged within so many seconds."""
+        entries = self.entries.get(name)
+        if entries is None:
+            return None
+        i = int(np.argmin(np.abs(entries[:, 0] - unix_s)))
+        return (entries[i, 1], entries[i, 2]) if abs(entries[i, 0] - unix_s) <= within_s else None
+
+
 def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
     """Take solved poses of results, each with the motor positions that were logged nearest to its frame.
 
@@ -82,10 +112,7 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
     from rfpose.pipeline.formats.result import frame_time
     from rfpose.pipeline.formats.result_file import open_result
 
-    log: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
-    for row in _rows(motors, ("time_utc", "heliostat", "axis_1", "axis_2")):
-        log[row.text["heliostat"]].append((row.unix_s, row.number("axis_1"), row.number("axis_2")))
-    table = {name: np.array(sorted(entries)) for name, entries in log.items()}
+    log = MotorLog.read(motors)
     kept: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     left_out = {}
     for i_result, given in enumerate(results):
@@ -99,12 +126,12 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
                 if not np.isfinite(result.poses.normal_enu[i, h]).all():
                     left_out[f"{source} frame {i} {name}"] = status.reason
                     continue
-                entry = _nearest(table.get(name), unix_s, within_s)
-                if entry is None:
+                count = log.count(name, unix_s, within_s=within_s)
+                if count is None:
                     left_out[f"{source} frame {i} {name}"] = f"no motor position within {within_s:g} s"
                     continue
                 sigma = max(float(result.poses.sigma_rad[i, h]) / math.sqrt(2.0), 1e-7)
-                kept[name].append((unix_s, entry[1], entry[2], *result.poses.normal_enu[i, h], sigma))
+                kept[name].append((unix_s, *count, *result.poses.normal_enu[i, h], sigma))
     if not kept:
         why = next(iter(left_out.values()), "no pose at all")
         raise RecordingError(f"{motors}: no pose has a motor position: {why}; check times and heliostats' names")
@@ -122,13 +149,6 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
         },
         left_out=left_out,
     )
-
-
-def _nearest(entries: Any, unix_s: float, within_s: float) -> Any:
-    if entries is None:
-        return None
-    i = int(np.argmin(np.abs(entries[:, 0] - unix_s)))
-    return entries[i] if abs(entries[i, 0] - unix_s) <= within_s else None
 
 
 def read_paint(directory: Path, names: Sequence[str], *, algorithm: str = "both") -> tuple[Gathered, MountFile]:

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.feedback.correlated import AXES_AND_ZEROS, CorrelatedFit
+from rfpose.feedback.mount import Mount
 from rfpose.files import claim
 from rfpose.multilat.site import (
     Constants,
@@ -23,16 +25,18 @@ from rfpose.multilat.site import (
     SurveyPrior,
     survey_site,
 )
-from rfpose.pipeline.formats.survey_file import SurveyFile, write_survey
+from rfpose.pipeline.formats.mount_file import MountFile, read_models
+from rfpose.pipeline.formats.survey_file import SurveyedMounts, SurveyFile, write_survey
 from rfpose.pipeline.measure import measure_tones
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.postures import commanded_normals, read_postures
 from rfpose.pipeline.site.field import SiteField, antenna_of
+from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts, surveyed_mounts
 from rfpose.pipeline.site.poses import check_site_solvable, knowledge_of, rotations, settings_of, wavenumbers_of
 from rfpose.recording import Recording, check_against, frame_starts, open_recording
 from rfpose.scenario import Scenario, scenario_of
 
-__all__ = ["survey"]
+__all__ = ["Besides", "Frames", "survey", "survey_frames"]
 
 
 def survey(
@@ -42,6 +46,8 @@ def survey(
     scenario: Scenario | str | Path | None = None,
     reference: str | Path | None = None,
     reference_sigma_rad: float = 1e-4,
+    mounts: str | Path | MountFile | None = None,
+    motors: str | Path | None = None,
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
@@ -61,6 +67,11 @@ def survey(
         counted through all recordings.
     reference_sigma_rad
         How good they are, in each of two directions [rad].
+    mounts
+        Mounts that control believed in, format ``rfpose-mount``; without it azimuth over elevation.
+    motors
+        Log of motor positions, in the counts of ``mounts``: CSV with time_utc, heliostat, axis_1, axis_2. Without it
+        they stood where those mounts have the commanded normals.
     follow_links, force
         As for `rfpose.pipeline.process.process`.
     on_progress
@@ -73,7 +84,7 @@ def survey(
     ScenarioError
         No scenario, or one that pose ``site`` cannot solve, or whose mirrors know no posture.
     InvalidInputError
-        No recording; a sigma that is not above zero.
+        No recording; a sigma that is not above zero; motors without mounts.
 
     Examples
     --------
@@ -96,33 +107,101 @@ def survey(
         raise InvalidInputError("`recordings` must name one recording or more")
     if not reference_sigma_rad > 0.0:
         raise InvalidInputError(f"`reference_sigma_rad` must be greater than zero, got {reference_sigma_rad}")
+    if motors is not None and mounts is None:
+        raise InvalidInputError("`motors` are counted as the mounts' drives have it: give `mounts=FILE` with them")
     read = [r for r in many if not isinstance(r, Recording)]
-    scenario_file = None if isinstance(scenario, Scenario) else scenario
-    with claim(output, inputs=[*read, scenario_file, reference], force=force):
+    files = [f for f in (scenario, reference, mounts, motors) if isinstance(f, str | Path)]
+    with claim(output, inputs=[*read, *files], force=force):
         site = None if scenario is None else scenario_of(scenario)
         parts = []
         for recording in many:
-            part = _measured(recording, site, follow_links=follow_links)
-            site = part.scenario
+            part, site = _measured(recording, site, follow_links=follow_links)
             parts.append(part)
         assert site is not None
-        found = _surveyed(parts, site, reference, reference_sigma_rad, on_progress)
+        besides = Besides.read(site, parts, reference, reference_sigma_rad, mounts, motors)
+        found = survey_frames(parts, site, besides, on_progress=on_progress)
         if output is not None:
             write_survey(output, found, force=True)
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """What one recording tells."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frames:
+    """What one recording tells.
 
-    scenario: Scenario
+    Attributes
+    ----------
+    carrier, sigma : (frame, receiver axis, transmitter)
+        As `rfpose.dsp.TonePhases` has them.
+    unix_s : (frame,)
+        Their middle [s since 1970 UTC]; NaN: unknown.
+    simulated
+        Whether it was simulated: then mirrors follow the simulated sun, not that of the time.
+    """
+
     carrier: npt.NDArray[np.complex128]
     sigma: FloatArray
     unix_s: FloatArray
+    simulated: bool = False
 
 
-def _measured(recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool) -> _Part:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Besides:
+    """What is known besides recordings.
+
+    Attributes
+    ----------
+    reference_enu : (frame, heliostat, xyz)
+        Normals from elsewhere; NaN: none. None: of no frame.
+    reference_sigma_rad
+        How good they are [rad].
+    mounts
+        That control believes in, by heliostat.
+    count : (frame, heliostat, axis)
+        Where motors stood; NaN: unknown. None: where those mounts have the commanded normals.
+    """
+
+    mounts: list[Mount]
+    reference_enu: FloatArray | None = None
+    reference_sigma_rad: float = 1e-4
+    count: FloatArray | None = None
+
+    @classmethod
+    def read(
+        cls,
+        site: Scenario,
+        parts: list[Frames],
+        reference: str | Path | None,
+        reference_sigma_rad: float,
+        mounts: str | Path | MountFile | None,
+        motors: str | Path | None,
+    ) -> Besides:
+        """Read the files that `survey` was given."""
+        unix_s = np.concatenate([part.unix_s for part in parts])
+        given = read_models(mounts) if isinstance(mounts, str | Path) else mounts
+        known = None if given is None else {name: stored.mount for name, stored in given.heliostats.items()}
+        count = None
+        if motors is not None:
+            from rfpose.pipeline.calibration_sources import MotorLog  # knows cameras, too
+
+            log = MotorLog.read(Path(motors))
+            nowhere = (np.nan, np.nan)
+            count = np.array([[log.count(h, t) or nowhere for h in site.heliostat_ids] for t in unix_s.tolist()])
+            if np.isnan(count).all():
+                raise RecordingError(
+                    f"{motors}: has no entry of the site's heliostats within 1 s of a frame; check times and names"
+                )
+        return cls(
+            mounts=planned_mounts(site, known),
+            reference_enu=None if reference is None else read_postures(reference, list(site.heliostat_ids), unix_s),
+            reference_sigma_rad=reference_sigma_rad,
+            count=count,
+        )
+
+
+def _measured(
+    recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool
+) -> tuple[Frames, Scenario]:
     opened: contextlib.AbstractContextManager[Recording] = (
         contextlib.nullcontext(recording)
         if isinstance(recording, Recording)
@@ -138,31 +217,35 @@ def _measured(recording: Recording | str | Path, site: Scenario | None, *, follo
         if not len(starts):
             raise ScenarioError(f"{one.path}: no stretch as long as a frame; shorten radio.frame_samples")
         tones = measure_tones(one, chosen, starts, estimator="hilbert")
-        unix_s = np.array([float(Fraction(int(s)) / one.sample_rate) for s in starts])
-        return _Part(chosen, tones.carrier, tones.carrier_sigma, unix_s)
+        middle = np.array([float((int(s) + Fraction(chosen.radio.frame_samples, 2)) / one.sample_rate) for s in starts])
+        frames = Frames(
+            carrier=tones.carrier, sigma=tones.carrier_sigma, unix_s=middle, simulated=one.truth is not None
+        )
+        return frames, chosen
 
 
-def _surveyed(
-    parts: list[_Part],
+def survey_frames(
+    parts: list[Frames],
     site: Scenario,
-    reference: str | Path | None,
-    reference_sigma_rad: float,
-    on_progress: Callable[[int, int], None] | None,
+    besides: Besides,
+    *,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> SurveyFile:
-    commanded = np.concatenate([commanded_normals(site, part.unix_s) for part in parts])
+    """Find what does not change over frames; see `survey`."""
+    commanded = np.concatenate([commanded_normals(site, part.unix_s, simulated=part.simulated) for part in parts])
     if np.isnan(commanded[:, : len(site.heliostat)]).all():
         raise ScenarioError(
             f"scenario `{site.name}` says of no mirror where it was told to point; give [posture] csv, or `normal_enu`"
         )
-    normals = None
-    if reference is not None:
-        normals = read_postures(reference, list(site.heliostat_ids), np.concatenate([p.unix_s for p in parts]))
     groups = list(mirror_groups(site))
     if len(groups) > 1 and any(t.survey_sigma_m > 0.0 for t in site.transmitter):
         raise ScenarioError(
             f"scenario `{site.name}` has mirrors of {len(groups)} kinds, and transmitters are surveyed by mirrors of "
             "one kind alone; leave `survey_sigma_m` of [[transmitter]] out"
         )
+    count = besides.count
+    if count is None:
+        count = commanded_counts(besides.mounts, commanded[:, : len(site.heliostat)])
     out = _Tables(site)
     for g, group in enumerate(groups):
 
@@ -170,18 +253,20 @@ def _surveyed(
             if on_progress is not None:
                 on_progress(g * total + done, len(groups) * total)
 
-        out.put(group, _survey_group(parts, site, group, commanded, (normals, reference_sigma_rad), told))
+        found = _survey_group(parts, site, group, commanded, besides, told)
+        out.put(group, found)
+        out.put_mounts(group, surveyed_mounts(found, group, besides.mounts, count))
     if on_progress is not None:
         on_progress(1, 1)
     return out.outcome()
 
 
 def _survey_group(
-    parts: list[_Part],
+    parts: list[Frames],
     site: Scenario,
     group: MirrorGroup,
     commanded: FloatArray,
-    reference: tuple[FloatArray | None, float],
+    besides: Besides,
     on_round: Callable[[int, int], None],
 ) -> Survey:
     told = rotations(commanded[:, group.column].reshape(-1, 3))
@@ -212,11 +297,10 @@ def _survey_group(
         there = replace(group, places_m=now.receiver_mirror_m, pivot_enu_m=now.pivot_enu_m)
         return SiteField(moved, there, standing, antenna)
 
-    normals, sigma = reference
     poses = None
-    if normals is not None:
-        picked = normals[:, group.column].reshape(-1, 3)
-        poses = ReferencePoses(normal_enu=picked, sigma_rad=np.full(len(picked), sigma))
+    if besides.reference_enu is not None:
+        picked = besides.reference_enu[:, group.column].reshape(-1, 3)
+        poses = ReferencePoses(normal_enu=picked, sigma_rad=np.full(len(picked), besides.reference_sigma_rad))
     return survey_site(
         SiteObservations(
             carrier=np.concatenate([group.of_mirrors(p.carrier) for p in parts]),
@@ -251,6 +335,8 @@ class _Tables:
         self._pivot, self._pivot_sigma = np.empty((n, 3)), np.empty((n, 3))
         self._delay = np.full((n, most), np.nan)
         self._frames, self._rank = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._worth, self._share, self._angle = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._mounts: dict[int, CorrelatedFit] = {}
         self._normal = np.empty((n, 4))
         self._transmitter: FloatArray = np.array(site.transmitter_enu_m)
         self._transmitter_sigma: FloatArray = np.zeros(self._transmitter.shape)
@@ -267,6 +353,8 @@ class _Tables:
         self._pivot_sigma[c] = np.sqrt(np.einsum("mpp->mp", found.cov)[:, 3 * n : 3 * n + 3])
         self._delay[c, :n] = at.delay_m
         self._frames[c], self._rank[c] = found.n_frame, found.rank
+        self._worth[c] = found.n_independent
+        self._share[c], self._angle[c] = found.correlation.share, found.correlation.angle_rad
         self._normal[c] = found.normal_sigma_rad
         for i, words in zip(c.tolist(), found.undetermined, strict=True):
             self._words[i] = words
@@ -277,13 +365,27 @@ class _Tables:
         change = complex(common.soil_change)
         self._soil = (np.array([change.real, change.imag]), np.array(common.soil_sigma))
 
+    def put_mounts(self, group: MirrorGroup, mounts: list[CorrelatedFit]) -> None:
+        """Write one group's mounts."""
+        self._mounts.update(zip(group.column.tolist(), mounts, strict=True))
+
     def outcome(self) -> SurveyFile:
         """Return the survey."""
+        fits = [self._mounts[i] for i in range(len(self._words))]
+        mounts = SurveyedMounts(
+            parameter=np.array([[fit.mount.parameters[name] for name in AXES_AND_ZEROS] for fit in fits]),
+            cov=np.array([fit.covariance for fit in fits]),
+            rank=np.array([fit.rank for fit in fits], np.int64),
+            scatter=np.array([fit.scatter for fit in fits]),
+            normal_sigma_rad=np.array([fit.normal_sigma_rad for fit in fits]),
+            undetermined=tuple(fit.undetermined for fit in fits),
+        )
         return SurveyFile(
             scenario=self._site, receiver_mirror_m=self._place, receiver_cov_m2=self._place_cov,
             pivot_enu_m=self._pivot, pivot_sigma_m=self._pivot_sigma, transmitter_enu_m=self._transmitter,
             transmitter_sigma_m=self._transmitter_sigma, delay_m=self._delay, permittivity_change=self._soil[0],
-            permittivity_sigma=self._soil[1], frame_count=self._frames, rank=self._rank,
+            permittivity_sigma=self._soil[1], frame_count=self._frames, frame_worth=self._worth,
+            correlation_share=self._share, correlation_rad=self._angle, rank=self._rank, mounts=mounts,
             normal_sigma_rad=self._normal, undetermined=tuple(self._words),
             transmitters_undetermined=self._transmitters,
         )  # fmt: skip

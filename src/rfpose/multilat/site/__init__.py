@@ -1,5 +1,6 @@
 """Poses outdoors: carriers compared between a mirror's receivers, with the rays in the model that geometry foresees."""
 
+from rfpose.multilat.site.correlation import PostureCorrelation, found_correlation
 from rfpose.multilat.site.fit import (
     Common,
     FieldAt,
@@ -29,6 +30,7 @@ __all__ = [
     "Disturbance",
     "FieldAt",
     "ForeseenMirrors",
+    "PostureCorrelation",
     "ReferencePoses",
     "SiteKnowledge",
     "SiteObservations",
@@ -39,6 +41,7 @@ __all__ = [
     "Voltages",
     "fit_site",
     "forecast_site",
+    "found_correlation",
     "lever_to_turn",
     "spread_starts",
     "survey_site",

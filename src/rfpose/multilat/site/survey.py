@@ -3,7 +3,9 @@ r"""What does not change while mirrors turn, from their carriers in many posture
 Each frame of each mirror has its own pose and its own phase a transmitter. They are eliminated from the frame's
 linearised phases (`fit.py`'s model, with its weights and its covariance); what remains says something of the constants,
 and is summed over the frames of a mirror and, for the transmitters, over mirrors. Poses are free: what control
-commanded is off in the same way in all frames, so that averaging it over frames would feign a knowledge.
+commanded is off in the same way in all frames, so that averaging it over frames would feign a knowledge. Nor are frames
+of near postures independent: what nothing foresees is alike in them (`correlation.py`), and each counts as much less as
+there are frames like it.
 
 References
 ----------
@@ -22,6 +24,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.site import _kernels
+from rfpose.multilat.site.correlation import PostureCorrelation, found_correlation
 from rfpose.multilat.site.fit import (
     FieldAt,
     SiteKnowledge,
@@ -138,6 +141,12 @@ class Survey:
         [m²].
     n_frame : (mirror,)
         Frames that told something.
+    n_independent : (mirror,)
+        How many independent ones they are worth.
+    correlation
+        Of errors over posture.
+    turn_by_constant : (frame × mirror, xy, constant)
+        What an error of a mirror's constants makes of its turn about its own x and y [rad/m]; NaN: no pose.
     rank : (mirror,)
         How many directions of its constants measurements determine better than they were known.
     undetermined : (mirror,)
@@ -158,6 +167,9 @@ class Survey:
     prior_sigma_m: FloatArray
     transmitter_cov: FloatArray
     n_frame: IntArray
+    n_independent: FloatArray
+    correlation: PostureCorrelation
+    turn_by_constant: FloatArray
     rank: IntArray
     undetermined: tuple[tuple[str, ...], ...]
     transmitters_undetermined: tuple[str, ...]
@@ -165,6 +177,33 @@ class Survey:
     poses: SitePoses
     rounds: int
     settled: bool
+
+    def normal_cov(self, mirror: int) -> FloatArray:
+        """Return the covariance of a mirror's normals over frames, and between them.
+
+        Returns
+        -------
+        (frame, xy, frame, xy)
+            Of the components along the mirror's x and y [rad²]. NaN: frames without a pose.
+
+        Notes
+        -----
+        Noise and multipath go together as near as the postures are; constants' errors are the same in all frames, a
+        turn of the receivers against the plate wholly.
+        """
+        n_mirror = len(self.n_frame)
+        own = slice(mirror, None, n_mirror)
+        rot, normal = self.poses.rot_enu_from_mirror[own], self.poses.normal_enu[own]
+        turn = np.einsum("fxa,fxy,fyb->fab", rot, self.poses.cov[own, 3:, 3:], rot)[:, :2, :2]
+        known = np.isfinite(turn).all(axis=(1, 2))
+        value, vector = np.linalg.eigh(np.where(known[:, None, None], turn, np.eye(2)))
+        root = np.einsum("fab,fb,fcb->fac", vector, np.sqrt(np.maximum(value, 0.0)), vector)
+        out = np.einsum("fab,fg,gcb->fagc", root, self.correlation.between(normal), root)
+        by_constant = self.turn_by_constant[own]
+        out += np.einsum("fap,pq,gbq->fagb", by_constant, self.cov[mirror], by_constant)
+        # a turn w moves the normal z by w x z: along x by the turn about y, along y by minus that about x
+        moved = np.array([[0.0, 1.0], [-1.0, 0.0]])
+        return np.asarray(np.einsum("ac,fcgd,bd->fagb", moved, out, moved))
 
 
 CASES = ("before", "now", "one reference pose more", "one receiver surveyed")
@@ -251,6 +290,10 @@ class _Solved:
     transmitter_told: FloatArray
     transmitter_cov: FloatArray
     n_frame: IntArray
+    worth: FloatArray
+    """(frame × mirror,) in independent frames; zero: told nothing."""
+    correlation: PostureCorrelation
+    turn_by_constant: FloatArray
 
 
 class _System:
@@ -316,16 +359,21 @@ class _System:
         common = np.zeros((n_common, n_common))
         own_rhs, common_rhs = np.zeros((self.n_mirror, n_own)), np.zeros(n_common)
         n_frame = np.zeros(self.n_mirror, np.int64)
-        nu = poses.common.tail
-        share = (nu + 1.0) / (nu + 3.0)  # expected information of Student's t beside that of its weights
-        linear = _Linear(self, poses, voltages, settings)
-        for row in np.flatnonzero(np.isfinite(poses.normal_enu[:, 0])):
+        correlation = found_correlation(poses, self.n_mirror)
+        worth = np.zeros(len(poses.normal_enu))
+        for m in range(self.n_mirror):
+            worth[m :: self.n_mirror] = correlation.worth(poses.normal_enu[m :: self.n_mirror])
+        turned = np.full((len(worth), 2, n_own), np.nan)
+        linear = _Linear(self, poses, voltages, settings, change)
+        for row in np.flatnonzero(worth > 0.0).tolist():
             m = row % self.n_mirror
-            whitened = linear.reduced(int(row), self.given, change)
-            if whitened is None:
+            rows = linear.rows(row)
+            if rows is None:
+                worth[row] = 0.0
                 continue
-            a, left = whitened[:, :-1] * np.sqrt(share), whitened[:, -1] * np.sqrt(share)
-            own, shared = a[:, :n_own], a[:, n_own:]
+            turned[row] = rows.turn_by_constant(poses.rot_enu_from_mirror[row])[:, :n_own]
+            reduced = linear.reduced(row, rows, worth[row])
+            own, shared, left = reduced[:, :n_own], reduced[:, n_own:-1], reduced[:, -1]
             told[m] += own.T @ own
             mixed[m] += own.T @ shared
             common += shared.T @ shared
@@ -346,8 +394,9 @@ class _System:
         alone = told - mixed @ np.linalg.inv(others) @ mixed.swapaxes(1, 2)
         sigma = np.concatenate([np.sqrt(np.einsum("mpp->mp", cov)).ravel(), np.sqrt(np.diag(common_cov))])
         return _Solved(
-            change + np.concatenate([step.ravel(), moved]), sigma, alone, cov, common_told, common_cov, n_frame
-        )
+            change + np.concatenate([step.ravel(), moved]), sigma, alone, cov, common_told, common_cov, n_frame,
+            worth, correlation, turned / self.prior_sigma,
+        )  # fmt: skip
 
     def outcome(self, solved: _Solved, poses: SitePoses, rounds: int, settled: bool) -> Survey:
         """Return what was found, in metres and words."""
@@ -365,7 +414,9 @@ class _System:
         return Survey(
             constants=now, cov=cov, prior_sigma_m=scale,
             transmitter_cov=solved.transmitter_cov * moved * moved[:, None],
-            n_frame=solved.n_frame, rank=np.array([rank for rank, _ in words]),
+            n_frame=solved.n_frame, n_independent=solved.worth.reshape(-1, self.n_mirror).sum(axis=0),
+            correlation=solved.correlation, turn_by_constant=solved.turn_by_constant,
+            rank=np.array([rank for rank, _ in words]),
             undetermined=tuple(named for _, named in words),
             transmitters_undetermined=self._transmitters_undetermined(solved.transmitter_told),
             normal_sigma_rad=np.array(normal), poses=poses, rounds=rounds, settled=settled,
@@ -445,20 +496,53 @@ def _updated(cov: FloatArray, rows: FloatArray, noise: FloatArray) -> FloatArray
     return np.asarray(cov - gain @ rows @ cov)
 
 
-class _Linear:
-    """Phases of one frame of one mirror, linear in pose and constants."""
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Phases of one frame of one mirror, whitened: linear in pose and transmitters' phases, and in constants.
 
-    def __init__(self, system: _System, poses: SitePoses, voltages: Voltages, settings: SiteSettings) -> None:
+    Pose and phases are (turn about east, north, up, then a phase a transmitter); the constants are in prior sigmas,
+    with the residual behind them.
+    """
+
+    nuisance: FloatArray
+    rest: FloatArray
+
+    def turn_by_constant(self, rot: FloatArray) -> FloatArray:
+        """Return what an error of the constants makes of the turn about the mirror's x and y (xy, constant)."""
+        scale = np.fmax(np.linalg.norm(self.nuisance, axis=0), 1e-300)
+        gain = np.linalg.pinv(self.nuisance / scale, rcond=_FREE)[:3] / scale[:3, None]
+        return np.asarray(-(rot.T @ gain)[:2] @ self.rest[:, :-1])
+
+
+class _Linear:
+    """Phases of mirrors, linear about their poses and constants."""
+
+    def __init__(
+        self, system: _System, poses: SitePoses, voltages: Voltages, settings: SiteSettings, change: FloatArray
+    ) -> None:
         self._system, self._poses, self._voltages = system, poses, voltages
         self._heard = heard_by(voltages, system.seen.carrier.shape, settings, poses.common)
+        self._now = system.constants(change)
+        nu = poses.common.tail
+        self._share = (nu + 1.0) / (nu + 3.0)
+        """Expected information of Student's t beside that of its weights."""
 
-    def reduced(self, row: int, given: Constants, change: FloatArray) -> FloatArray | None:
-        """Return whitened rows (link, constant + 1), pose and transmitters' phases taken out; last: residual."""
-        system, poses, heard = self._system, self._poses, self._heard
+    def reduced(self, row: int, rows: _Rows, worth: float) -> FloatArray:
+        """Return rows (link, constant + 1) of a frame that counts so much, pose and phases taken out."""
+        size = np.sqrt(self._share * worth)
+        # what a camera measured does not go together over postures
+        nuisance, rest = self._with_reference(row, size * rows.nuisance, size * rows.rest)
+        scale = np.fmax(np.linalg.norm(nuisance, axis=0), 1e-300)
+        basis, value, _ = np.linalg.svd(nuisance / scale, full_matrices=False)
+        basis = basis[:, value > _FREE * value[0]]
+        return np.asarray(rest - basis @ (basis.T @ rest))
+
+    def rows(self, row: int) -> _Rows | None:
+        """Return the whitened phases of a frame; None where they cannot tell a pose."""
+        system, poses, heard, now = self._system, self._poses, self._heard, self._now
         wave = system.seen.wavenumber_radpm
         n_rx, n_tx = system.n_rx, system.n_tx
         n_link = n_rx * n_tx
-        now = system.constants(change)
         pivot, rot = now.pivot_enu_m[row % system.n_mirror], poses.rot_enu_from_mirror[row]
         begin, end = int(heard.first[row * n_link]), int(heard.first[(row + 1) * n_link])
         part = np.empty(max(end - begin, 1), np.complex128)
@@ -501,14 +585,7 @@ class _Linear:
         _kernels.add_soil_errors(begin, end, heard, part, h, row_of, share, len(use), covariance)
         lower = np.linalg.cholesky(covariance)
         whitened = np.linalg.solve(lower, np.column_stack([nuisance, constant, left]))
-        n_nuisance = nuisance.shape[1]
-        seen_row = whitened[:, :n_nuisance]
-        rest = whitened[:, n_nuisance:]
-        seen_row, rest = self._with_reference(row, seen_row, rest)
-        scale = np.fmax(np.linalg.norm(seen_row, axis=0), 1e-300)
-        basis, value, _ = np.linalg.svd(seen_row / scale, full_matrices=False)
-        basis = basis[:, value > _FREE * value[0]]
-        return np.asarray(rest - basis @ (basis.T @ rest))
+        return _Rows(whitened[:, : nuisance.shape[1]], whitened[:, nuisance.shape[1] :])
 
     def _with_reference(self, row: int, nuisance: FloatArray, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Add what a reference pose of this frame says of its orientation."""

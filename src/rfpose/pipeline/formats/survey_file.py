@@ -14,6 +14,8 @@ import numpy as np
 from rfpose import __version__, geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.feedback.correlated import AXES_AND_ZEROS
+from rfpose.feedback.correlated import CASES as MOUNT_CASES
 from rfpose.files import write_atomically
 from rfpose.multilat.site import CASES, lever_to_turn
 from rfpose.pipeline.formats.columns import Column, ColumnWriter, Labels, text_label
@@ -21,12 +23,16 @@ from rfpose.pipeline.formats.hdf5_values import FileReader, opened, text_of
 from rfpose.pipeline.formats.result import Result
 from rfpose.scenario import Scenario
 
-__all__ = ["SURVEY_FORMAT", "SURVEY_VERSION", "SurveyFile", "read_survey", "write_survey"]
+__all__ = ["SURVEY_FORMAT", "SURVEY_VERSION", "SurveyFile", "SurveyedMounts", "read_survey", "write_survey"]
 
 SURVEY_FORMAT = "rfpose-survey"
 SURVEY_VERSION = 1
 
 _AGAIN = "make it again with `rfpose survey`"
+_LENGTHS = {
+    "xyz": 3, "part": 2, "case": len(CASES), "mount_case": len(MOUNT_CASES), "parameter": len(AXES_AND_ZEROS),
+    "parameter_other": len(AXES_AND_ZEROS),
+}  # fmt: skip
 _FAR_SIGMAS = 6.0
 _ROUNDING_M = 1e-6
 _LEAST_PERMITTIVITY = 1.001
@@ -42,9 +48,48 @@ _KEYS = {
     "permittivity_change": Column(("part",), "f8", "1", "relative change of the ground's complex permittivity"),
     "permittivity_sigma": Column(("part",), "f8", "1", "standard deviation of that"),
     "frame_count": Column(("heliostat",), "i8", "1", "frames that told something"),
+    "frame_worth": Column(("heliostat",), "f8", "1", "how many independent ones they are worth"),
+    "correlation_share": Column(("heliostat",), "f8", "1", "of errors' variance, what turns slowly with posture"),
+    "correlation_rad": Column(("heliostat",), "f8", "rad", "angle between normals over which that falls to 1/e"),
     "rank": Column(("heliostat",), "i8", "1", "directions that measurements determine"),
     "normal_sigma_rad": Column(("heliostat", "case"), "f8", "rad", "error of normals that constants leave"),
 }
+_MOUNT_KEYS = {
+    "parameter": Column(("heliostat", "parameter"), "f8", "rad", "what mounts are off by"),
+    "cov": Column(("heliostat", "parameter", "parameter_other"), "f8", "rad2", "covariance of that"),
+    "rank": Column(("heliostat",), "i8", "1", "directions of it that normals determine"),
+    "scatter": Column(("heliostat",), "f8", "1", "of normals about the mount, in stated sigmas; NaN: too few to tell"),
+    "normal_sigma_rad": Column(("heliostat", "mount_case"), "f8", "rad", "error of a mount's normals; NaN: no posture"),
+}
+"""In the file each has `mount_` before its name."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyedMounts:
+    """What mounts are off by.
+
+    Attributes
+    ----------
+    parameter : (heliostat, parameter)
+        In the order of `rfpose.feedback.correlated.AXES_AND_ZEROS` [rad].
+    cov : (heliostat, parameter, parameter)
+        [rad²].
+    rank : (heliostat,)
+        Directions that normals determine.
+    scatter : (heliostat,)
+        Of normals about the mount, in stated sigmas; NaN: too few to tell.
+    normal_sigma_rad : (heliostat, case)
+        See `rfpose.feedback.correlated.CASES`; NaN: no posture.
+    undetermined
+        By heliostat, in words.
+    """
+
+    parameter: FloatArray
+    cov: FloatArray
+    rank: np.ndarray[Any, Any]
+    scatter: FloatArray
+    normal_sigma_rad: FloatArray
+    undetermined: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -65,13 +110,18 @@ class SurveyFile:
         [m].
     permittivity_change, permittivity_sigma : (real and imaginary part,)
         Of the ground, relative.
-    frame_count, rank : (heliostat,)
+    frame_count, frame_worth : (heliostat,)
+        Frames that told something, and how many independent ones they are worth.
+    correlation_share, correlation_rad : (heliostat,)
+        See `rfpose.multilat.site.PostureCorrelation`.
+    rank : (heliostat,)
     normal_sigma_rad : (heliostat, case)
         See `rfpose.multilat.site.CASES`.
     undetermined
         By heliostat, in words, what measurements do not tell.
     transmitters_undetermined
         The same of the transmitters.
+    mounts
     """
 
     scenario: Scenario
@@ -85,10 +135,14 @@ class SurveyFile:
     permittivity_change: FloatArray
     permittivity_sigma: FloatArray
     frame_count: np.ndarray[Any, Any]
+    frame_worth: FloatArray
+    correlation_share: FloatArray
+    correlation_rad: FloatArray
     rank: np.ndarray[Any, Any]
     normal_sigma_rad: FloatArray
     undetermined: tuple[tuple[str, ...], ...]
     transmitters_undetermined: tuple[str, ...]
+    mounts: SurveyedMounts
 
     def __repr__(self) -> str:
         seen = int(np.count_nonzero(self.frame_count))
@@ -183,6 +237,9 @@ class SurveyFile:
             place_sigma = np.sqrt(np.diagonal(self.receiver_cov_m2[i])[: 3 * n]).reshape(n, 3)
             heliostats[h.id] = {
                 "frames": int(self.frame_count[i]),
+                "frames_worth": float(self.frame_worth[i]),
+                "correlation_share": float(self.correlation_share[i]),
+                "correlation_deg": float(np.degrees(self.correlation_rad[i])),
                 "rank": int(self.rank[i]),
                 "undetermined": list(self.undetermined[i]),
                 "receiver_mirror_m": self.receiver_mirror_m[i, :n].tolist(),
@@ -192,6 +249,7 @@ class SurveyFile:
                 "pivot_sigma_m": self.pivot_sigma_m[i].tolist(),
                 "pivot_prior_sigma_m": h.pivot_sigma_m,
                 "normal_sigma_mrad": dict(zip(CASES, (1e3 * self.normal_sigma_rad[i]).tolist(), strict=True)),
+                "mount": self._mount_as_dict(i),
             }
         transmitters = {
             t.id: {
@@ -207,6 +265,21 @@ class SurveyFile:
             "transmitters_undetermined": list(self.transmitters_undetermined),
             "permittivity_change": self.permittivity_change.tolist(),
             "permittivity_sigma": self.permittivity_sigma.tolist(),
+        }
+
+    def _mount_as_dict(self, i: int) -> dict[str, Any]:
+        mounts = self.mounts
+        sigma = np.sqrt(np.diagonal(mounts.cov[i]))
+        normal, scatter = mounts.normal_sigma_rad[i], float(mounts.scatter[i])
+        return {
+            "parameters": dict(zip(AXES_AND_ZEROS, mounts.parameter[i].tolist(), strict=True)),
+            "sigma": dict(zip(AXES_AND_ZEROS, sigma.tolist(), strict=True)),
+            "rank": int(mounts.rank[i]),
+            "undetermined": list(mounts.undetermined[i]),
+            "scatter": scatter if np.isfinite(scatter) else None,
+            "normal_sigma_mrad": {
+                case: 1e3 * x if np.isfinite(x) else None for case, x in zip(MOUNT_CASES, normal.tolist(), strict=True)
+            },
         }
 
 
@@ -237,15 +310,22 @@ def write_survey(path: str | Path, survey: SurveyFile, *, force: bool = False) -
         "xyz": text_label("xyz", "axis"),
         "part": text_label(["real", "imaginary"], "part"),
         "case": text_label(CASES, "what is known"),
+        "mount_case": text_label(MOUNT_CASES, "what is known"),
+        "parameter": text_label(AXES_AND_ZEROS, "of a mount"),
+        "parameter_other": text_label(AXES_AND_ZEROS, "of a mount"),
     }
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110")) as file:
         file.attrs.update({"format": SURVEY_FORMAT, "version": SURVEY_VERSION, "made_by": f"rfpose {__version__}"})
         file["scenario"] = survey.scenario.to_toml()
-        file["undetermined"] = json.dumps([survey.undetermined, survey.transmitters_undetermined])
+        file["undetermined"] = json.dumps(
+            [survey.undetermined, survey.transmitters_undetermined, survey.mounts.undetermined]
+        )
         writer = ColumnWriter(file, labels)
         for name, column in _KEYS.items():
             writer.write(file, name, column, getattr(survey, name))
+        for name, column in _MOUNT_KEYS.items():
+            writer.write(file, f"mount_{name}", column, getattr(survey.mounts, name))
     write_atomically(path, image.getvalue(), force=force)
 
 
@@ -259,7 +339,7 @@ def read_survey(path: str | Path) -> SurveyFile:
     """
     path = Path(path)
     with opened(path, wanted="survey", version=SURVEY_VERSION, again=_AGAIN) as file:
-        reader = FileReader(path, file, length={"xyz": 3, "part": 2, "case": len(CASES)}, again=_AGAIN)
+        reader = FileReader(path, file, length=_LENGTHS, again=_AGAIN)
         scenario = reader.scenario()
         n = max((len(h.receiver_mirror_m) for h in scenario.heliostat), default=0)
         reader.length.update(
@@ -267,8 +347,12 @@ def read_survey(path: str | Path) -> SurveyFile:
             place_other=3 * n,
         )  # fmt: skip
         values = {name: reader.array(name, column) for name, column in _KEYS.items()}
-        words = _words(reader, len(scenario.heliostat))
-    found = SurveyFile(scenario=scenario, undetermined=words[0], transmitters_undetermined=words[1], **values)
+        mounts = {name: reader.array(f"mount_{name}", column) for name, column in _MOUNT_KEYS.items()}
+        own, common, of_mounts = _words(reader, len(scenario.heliostat))
+    found = SurveyFile(
+        scenario=scenario, undetermined=own, transmitters_undetermined=common,
+        mounts=SurveyedMounts(undetermined=of_mounts, **mounts), **values,
+    )  # fmt: skip
     for name in ("pivot_enu_m", "pivot_sigma_m", "transmitter_enu_m", "transmitter_sigma_m"):
         if not np.isfinite(values[name]).all() or (name.endswith("sigma_m") and (values[name] < 0.0).any()):
             raise reader.error(name, "holds what is no place or sigma")
@@ -277,8 +361,10 @@ def read_survey(path: str | Path) -> SurveyFile:
             raise reader.error(name, "must be finite, and a sigma not below zero")
     for i, h in enumerate(scenario.heliostat):
         cov = values["receiver_cov_m2"][i, : 3 * len(h.receiver_mirror_m), : 3 * len(h.receiver_mirror_m)]
-        if not np.isfinite(cov).all() or np.linalg.eigvalsh(0.5 * (cov + cov.T))[0] < -1e-12:
+        if not _is_covariance(cov):
             raise reader.error("receiver_cov_m2", f"is no covariance for heliostat `{h.id}`")
+        if not _is_covariance(mounts["cov"][i]) or not np.isfinite(mounts["parameter"][i]).all():
+            raise reader.error("mount_cov", f"or mount_parameter is none for heliostat `{h.id}`")
     try:
         found.applied(scenario)
     except (ScenarioError, InvalidInputError) as error:
@@ -286,14 +372,23 @@ def read_survey(path: str | Path) -> SurveyFile:
     return found
 
 
-def _words(reader: FileReader, n_heliostat: int) -> tuple[tuple[tuple[str, ...], ...], tuple[str, ...]]:
+def _is_covariance(square: FloatArray) -> bool:
+    return bool(np.isfinite(square).all() and np.linalg.eigvalsh(0.5 * (square + square.T))[0] >= -1e-12)
+
+
+_Words = tuple[tuple[str, ...], ...]
+
+
+def _words(reader: FileReader, n_heliostat: int) -> tuple[_Words, tuple[str, ...], _Words]:
+    """Return what is not determined: of each heliostat, of the transmitters, of each mount."""
     try:
-        own, common = json.loads(text_of(reader.file, "/undetermined"))
-        lists = [*own, common]
-        if len(own) != n_heliostat or not all(
+        own, common, mounts = json.loads(text_of(reader.file, "/undetermined"))
+        lists = [*own, common, *mounts]
+        if not len(own) == len(mounts) == n_heliostat or not all(
             isinstance(w, list) and all(isinstance(t, str) for t in w) for w in lists
         ):
             raise ValueError("is no list of words for each heliostat")
     except (ValueError, TypeError, RecursionError) as error:
         raise reader.error("undetermined", f"cannot be read ({error!s:.80})") from error
-    return tuple(tuple(t[:200] for t in w) for w in own), tuple(t[:200] for t in common)
+    own, mounts = (tuple(tuple(t[:200] for t in w) for w in words) for words in (own, mounts))
+    return own, tuple(t[:200] for t in common), mounts
