@@ -24,9 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import rfpose as rf
-from rfpose.feedback.correlated import AXES_AND_ZEROS, fit_correlated
+from rfpose.feedback.correlated import AXES_AND_ZEROS
 from rfpose.feedback.mount import Mount, command, posture
-from rfpose.feedback.selection import PLANNED_SIGMA
 from rfpose.geometry import unit
 from rfpose.multilat.site import PostureCorrelation
 
@@ -145,46 +144,42 @@ def in_the_field(options):
     """Print the table of mounts."""
     import real_field
 
-    from rfpose.pipeline.postures import commanded_normals
-    from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts
+    from rfpose.pipeline.site.mounts import planned_mounts
     from rfpose.pipeline.survey import Besides, Frames, survey_frames
 
     folders = real_field.Folders(given=options.traced, own=options.tables, patterns=options.patterns)
     suns = [sun for sun in range(40) if folders.table("open", 433.0, sun) is not None]
-    spec = next(
-        s for s in real_field.specs() if s.name == f"everything, 433 MHz, pattern {options.told}; {options.place}"
-    )
+    name = f"everything, 433 MHz, pattern {options.told}; {options.place}"
+    spec = next(s for s in real_field.specs() if s.name == name)
     case, mounts = traced_case(folders, spec, suns)
-    print(f"{len(suns)} suns; {options.place}, pattern {options.told}")
+    site, tones = case.scenario, case.tones
+    print(f"{options.place}, pattern {options.told}; {len(suns)} tables")
     print(
-        "| postures | worth | falls to 1/e over | rms of a mount's normal, stated [mrad] | NEES | white | tilts, zeros, square rms [mrad] |"
+        "| postures | worth | share, angle | mount's normal rms, stated [mrad] | NEES | tilts, zeros, square [mrad] |"
     )
-    print("|---|---|---|---|---|---|---|", flush=True)
-    for n in options.postures:
+    print("|---|---|---|---|---|---|", flush=True)
+    white = PostureCorrelation(share=0.0, angle_rad=1.0)
+    runs = [(n, None) for n in options.postures] + [(max(options.postures), white)]
+    for n, correlation in runs:
         if n > len(suns):
             print(f"| {n} | no so many tables |")
             continue
-        tones, site = case.tones, case.scenario
         frames = Frames(carrier=tones.carrier[:n], sigma=tones.carrier_sigma[:n], unix_s=np.full(n, np.nan))
         begin = time.perf_counter()
-        found = survey_frames([frames], site, Besides(mounts=planned_mounts(site, None)))
+        found = survey_frames([frames], site, Besides(mounts=planned_mounts(site, None), correlation=correlation))
         took = time.perf_counter() - begin
         judged = Judged()
         for i, true in enumerate(mounts):
-            judged.take(
-                found.mounts.parameter[i],
-                found.mounts.cov[i],
-                true,
-                case.normal_true_enu[:, i],
-                found.mounts.normal_sigma_rad[i, 1],
-            )
+            own = found.mounts
+            judged.take(own.parameter[i], own.cov[i], true, case.normal_true_enu[:, i], own.normal_sigma_rad[i, 1])
         rms, stated, nees, each = judged.row()
-        angle = np.degrees(found.correlation_rad[0])
+        angle, share = np.degrees(found.correlation_rad[0]), found.correlation_share[0]
+        alike = f"{share:.2f}, {angle:.1f}°" if correlation is None else "taken for white"
+        parameters = ", ".join(f"{x:.2f}" for x in each)
         print(
-            f"| {n} | {found.frame_worth.mean():.1f} | {angle:.1f}° x {found.correlation_share[0]:.2f} | {rms:.2f}, {stated:.2f} "
-            f"| {nees:.2f} | | {', '.join(f'{x:.2f}' for x in each)} | {took:.0f} s; scatter {np.round(found.mounts.scatter, 2)}",
-            flush=True,
+            f"| {n} | {found.frame_worth.mean():.1f} | {alike} | {rms:.2f}, {stated:.2f} | {nees:.2f} | {parameters} |"
         )
+        print(f"{took:.0f} s; scatter {np.round(found.mounts.scatter, 2)}", file=sys.stderr, flush=True)
 
 
 def main():

@@ -19,6 +19,7 @@ from rfpose.files import claim
 from rfpose.multilat.site import (
     Constants,
     FieldAt,
+    PostureCorrelation,
     ReferencePoses,
     SiteObservations,
     Survey,
@@ -159,12 +160,15 @@ class Besides:
         That control believes in, by heliostat.
     count : (frame, heliostat, axis)
         Where motors stood; NaN: unknown. None: where those mounts have the commanded normals.
+    correlation
+        Of errors over posture; None: found from residuals.
     """
 
     mounts: list[Mount]
     reference_enu: FloatArray | None = None
     reference_sigma_rad: float = 1e-4
     count: FloatArray | None = None
+    correlation: PostureCorrelation | None = None
 
     @classmethod
     def read(
@@ -315,6 +319,7 @@ def _survey_group(
             pivot_sigma_m=known.pivot_sigma_m,
             transmitter_sigma_m=np.array([t.survey_sigma_m for t in site.transmitter]),
             delay_sigma_m=known.clock_sigma_m,
+            correlation=besides.correlation,
         ),
         settings=settings_of(site),
         reference=poses,

@@ -51,7 +51,7 @@ ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
 _ROUNDS = 8
-_SETTLED_SIGMAS = 0.1
+_SETTLED_SIGMAS = 0.25
 """Of the change of constants by one round, beside their posterior sigma."""
 _HELD_PIVOT_M = 1e-5
 """Pivots are constants here: the fit of a single pose may not move its own."""
@@ -97,12 +97,15 @@ class SurveyPrior:
         Zero: taken as it is [m].
     delay_sigma_m
         Zero: there are none; infinity: another in every frame, which is not surveyed [m].
+    correlation
+        Of errors over posture; None: found from residuals.
     """
 
     place_sigma_m: float
     pivot_sigma_m: float
     transmitter_sigma_m: FloatArray
     delay_sigma_m: float
+    correlation: PostureCorrelation | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -311,6 +314,7 @@ class _System:
         self.carrier = observations.carrier
         self.n_mirror, self.n_rx = given.receiver_mirror_m.shape[:2]
         self.n_tx = len(given.transmitter_enu_m)
+        self.correlation = prior.correlation
         self.surveys_delays = 0.0 < prior.delay_sigma_m < np.inf
         self.free_delays = np.isinf(prior.delay_sigma_m)
         sigma = [np.full(3 * self.n_rx, prior.place_sigma_m), np.full(3, prior.pivot_sigma_m)]
@@ -359,7 +363,7 @@ class _System:
         common = np.zeros((n_common, n_common))
         own_rhs, common_rhs = np.zeros((self.n_mirror, n_own)), np.zeros(n_common)
         n_frame = np.zeros(self.n_mirror, np.int64)
-        correlation = found_correlation(poses, self.n_mirror)
+        correlation = self.correlation or found_correlation(poses, self.n_mirror)
         worth = np.zeros(len(poses.normal_enu))
         for m in range(self.n_mirror):
             worth[m :: self.n_mirror] = correlation.worth(poses.normal_enu[m :: self.n_mirror])
