@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rfpose.pipeline.formats.result_file import open_result
     from rfpose.pipeline.formats.track_file import open_track
     from rfpose.pipeline.layout import budget, layout_map, optimise
+    from rfpose.pipeline.learn import learn_pattern
     from rfpose.pipeline.process import process
     from rfpose.pipeline.simulate import simulate
     from rfpose.pipeline.survey import survey
@@ -37,6 +38,7 @@ __all__ = [
     "calibrate",
     "evaluate",
     "layout_map",
+    "learn_pattern",
     "load_scenario",
     "open_recording",
     "open_result",
@@ -54,6 +56,7 @@ _HOME = {
     "calibrate": "pipeline.calibrate",
     "evaluate": "pipeline.evaluate",
     "layout_map": "pipeline.layout",
+    "learn_pattern": "pipeline.learn",
     "load_scenario": "scenario",
     "open_recording": "recording",
     "open_result": "pipeline.formats.result_file",

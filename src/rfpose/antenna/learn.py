@@ -7,7 +7,9 @@ the receivers, by projection; errors of the postures as noise that their covaria
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +43,7 @@ _STRENGTHS_NEAR, _OWN_SIGMA_NEAR = (0.01, 0.03, 0.1), 0.1
 _FIXED = 1e6
 _NEAR_RAD = np.radians(10.0)
 _UNSURE = 0.1
+_UNDETERMINED = ("a factor common to all receivers", "a rotation common to all postures")
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -154,12 +157,38 @@ class LearnedPattern:
         """Variance, of postures held out, that the pattern explains of what a lone dipole leaves."""
         return 1.0 - (self.floor_held_out / self.floor_dipole) ** 2
 
+    @property
+    def unheard(self) -> tuple[float, ...]:
+        """(receiver,) part of the sphere from within ten degrees of which no ray came."""
+        return self._part_of_sphere(self.heard == 0)
+
+    @property
+    def unsure(self) -> tuple[float, ...]:
+        """(receiver,) part of the sphere where the pattern is known to no better than a tenth of a dipole."""
+        return self._part_of_sphere(self.pattern.sigma[0] > _UNSURE)
+
+    def _part_of_sphere(self, where: BoolArray) -> tuple[float, ...]:
+        area = np.sin(np.linspace(0.0, np.pi, where.shape[1]))[:, None] * np.ones(where.shape[2])
+        return tuple(float(np.average(one, weights=area)) for one in where)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what was learned, ready for JSON; NaN where too few postures could be held out."""
+        return {
+            "postures": self.n_posture,
+            "links": self.n_link,
+            "settled": self.settled,
+            "floor": self.floor,
+            "floor_held_out": self.floor_held_out,
+            "floor_dipole": self.floor_dipole,
+            "explained": self.explained,
+            "unheard": list(self.unheard),
+            "unsure": list(self.unsure),
+            "undetermined": list(_UNDETERMINED),
+        }
+
     def report(self) -> str:
         """Return what was learned in a few lines."""
-        n_polar = self.heard.shape[1]
-        area = np.sin(np.linspace(0.0, np.pi, n_polar))[:, None] * np.ones(self.heard.shape[2])
-        unheard = [f"{np.average(rays == 0, weights=area):.0%}" for rays in self.heard]
-        unsure = [f"{np.average(sigma > _UNSURE, weights=area):.0%}" for sigma in self.pattern.sigma[0]]
+        unheard, unsure = ([f"{part:.0%}" for part in parts] for parts in (self.unheard, self.unsure))
         held_out = "too few to hold some out"
         if np.isfinite(self.floor_held_out):
             held_out = f"in postures held out {self.floor_held_out:.3f}, {self.explained:.0%} of the variance explained"
@@ -169,12 +198,17 @@ class LearnedPattern:
             f"left of the direct field: {self.floor:.3f}, with lone dipoles {self.floor_dipole:.3f}; {held_out}\n"
             f"directions that no ray came from within 10 degrees of, by receiver: {', '.join(unheard)}; "
             f"with sigma above {_UNSURE:g}: {', '.join(unsure)}\n"
-            "undetermined: a factor common to all receivers; a rotation common to all postures"
+            f"undetermined: {'; '.join(_UNDETERMINED)}"
         )
 
 
 def learn_pattern(
-    postures: PostureCarriers, mirror: MirrorType, *, frequency_hz: float, start: AntennaPattern | None = None
+    postures: PostureCarriers,
+    mirror: MirrorType,
+    *,
+    frequency_hz: float,
+    start: AntennaPattern | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> LearnedPattern:
     """Learn the pattern of a type of mirror from carriers in postures that are roughly known.
 
@@ -188,6 +222,8 @@ def learn_pattern(
         Of the carriers [Hz]; the pattern is of this one.
     start
         A pattern that the true one is near to, as NEC gives it: fewer postures are enough. None: nothing is known.
+    on_progress
+        Called with (rounds done, rounds at most).
 
     Raises
     ------
@@ -207,6 +243,8 @@ def learn_pattern(
         near = currents.nearest_to(start.table(frequency_hz), _plate_sigma(currents, _STRENGTHS[-1]))
         prior = _Prior(near, _OWN_SIGMA_NEAR, _STRENGTHS_NEAR)
     problem = _Problem(postures, currents, frequency_hz)
+    if on_progress is not None:
+        problem.tell = _counting(on_progress, (len(prior.strengths) + 1) * _MOST_ROUNDS)
     strength, floor_held_out = _chosen_strength(problem, prior)
     final = problem.fit(prior.mean, prior.sigma(currents, strength), problem.usable)
     return LearnedPattern(
@@ -222,6 +260,18 @@ def learn_pattern(
         n_posture=int(problem.usable.any(axis=(1, 2)).sum()),
         n_link=int(problem.usable.sum()),
     )
+
+
+def _counting(on_progress: Callable[[int, int], None], total: int) -> Callable[[int], None]:
+    """Return what is told of rounds, one after the other; a fit that comes to rest early tells of all its rounds."""
+    done = 0
+
+    def tell(rounds: int) -> None:
+        nonlocal done
+        done += rounds
+        on_progress(min(done, total), total)
+
+    return tell
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,6 +336,7 @@ class _Problem:
     """The equations of one set of postures: carriers = factor · design · currents, relative to the direct field."""
 
     def __init__(self, postures: PostureCarriers, currents: Currents, frequency_hz: float) -> None:
+        self.tell: Callable[[int], None] = lambda rounds: None
         self.currents, self.frequency_hz = currents, frequency_hz
         self._field: ComplexArray
         self.n_posture, self.n_receiver, self.n_transmitter = shape = postures.amplitude.shape
@@ -400,7 +451,8 @@ class _Problem:
         # as large as they please, all currents together would shrink: their unit is that dipoles are 1 in the mean
         own = self.currents.dipoles().ravel() / self.n_receiver
         information = np.diag(1.0 / sigma.ravel() ** 2) + _FIXED * np.outer(own, own.conj())
-        for _ in range(_MOST_ROUNDS):
+        for k in range(_MOST_ROUNDS):
+            self.tell(1)
             factor, left, weight = self._left(self.modelled(coefficient), used, floor)
             normal, slope = self._normal_equations(coefficient, factor, left, weight)
             covariance = np.linalg.inv(normal + information)
@@ -413,6 +465,7 @@ class _Problem:
             settled = moved < _SETTLED and abs(found / floor - 1.0) < _SETTLED_FLOOR
             floor = max(found, floor / _LESS_A_ROUND)
             if settled:
+                self.tell(_MOST_ROUNDS - k - 1)
                 break
         return _Fit(coefficient, _without_common_factor(np.asarray(covariance), coefficient.ravel()), floor, settled)
 

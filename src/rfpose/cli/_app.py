@@ -26,6 +26,7 @@ COMMANDS = (
     "process",
     "evaluate",
     "survey",
+    "antenna",
     "layout",
     "calibrate",
     "aim",

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
@@ -28,13 +25,13 @@ from rfpose.multilat.site import (
 )
 from rfpose.pipeline.formats.mount_file import MountFile, read_models
 from rfpose.pipeline.formats.survey_file import SurveyedMounts, SurveyFile, write_survey
-from rfpose.pipeline.measure import measure_tones
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
-from rfpose.pipeline.postures import commanded_normals, read_postures
+from rfpose.pipeline.postures import read_postures
 from rfpose.pipeline.site.field import SiteField, antenna_of
+from rfpose.pipeline.site.frames import Frames, commanded_in, measured_frames
 from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts, surveyed_mounts
-from rfpose.pipeline.site.poses import check_site_solvable, knowledge_of, rotations, settings_of, wavenumbers_of
-from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.pipeline.site.poses import knowledge_of, rotations, settings_of, wavenumbers_of
+from rfpose.recording import Recording
 from rfpose.scenario import Scenario, scenario_of
 
 __all__ = ["Besides", "Frames", "survey", "survey_frames"]
@@ -116,7 +113,7 @@ def survey(
         site = None if scenario is None else scenario_of(scenario)
         parts = []
         for recording in many:
-            part, site = _measured(recording, site, follow_links=follow_links)
+            part, site = measured_frames(recording, site, follow_links=follow_links)
             parts.append(part)
         assert site is not None
         besides = Besides.read(site, parts, reference, reference_sigma_rad, mounts, motors)
@@ -124,26 +121,6 @@ def survey(
         if output is not None:
             write_survey(output, found, force=True)
         return found
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Frames:
-    """What one recording tells.
-
-    Attributes
-    ----------
-    carrier, sigma : (frame, receiver axis, transmitter)
-        As `rfpose.dsp.TonePhases` has them.
-    unix_s : (frame,)
-        Their middle [s since 1970 UTC]; NaN: unknown.
-    simulated
-        Whether it was simulated: then mirrors follow the simulated sun, not that of the time.
-    """
-
-    carrier: npt.NDArray[np.complex128]
-    sigma: FloatArray
-    unix_s: FloatArray
-    simulated: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,31 +180,6 @@ class Besides:
         )
 
 
-def _measured(
-    recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool
-) -> tuple[Frames, Scenario]:
-    opened: contextlib.AbstractContextManager[Recording] = (
-        contextlib.nullcontext(recording)
-        if isinstance(recording, Recording)
-        else open_recording(recording, follow_links=follow_links)
-    )
-    with opened as one:
-        chosen = one.scenario if site is None else site
-        if chosen is None:
-            raise ScenarioError(f"{one.path}: holds no scenario; describe the site in TOML and give `scenario=FILE`")
-        check_against(one, chosen)
-        check_site_solvable(chosen)
-        starts = frame_starts(one, chosen.radio.frame_samples)
-        if not len(starts):
-            raise ScenarioError(f"{one.path}: no stretch as long as a frame; shorten radio.frame_samples")
-        tones = measure_tones(one, chosen, starts, estimator="hilbert")
-        middle = np.array([float((int(s) + Fraction(chosen.radio.frame_samples, 2)) / one.sample_rate) for s in starts])
-        frames = Frames(
-            carrier=tones.carrier, sigma=tones.carrier_sigma, unix_s=middle, simulated=one.truth is not None
-        )
-        return frames, chosen
-
-
 def survey_frames(
     parts: list[Frames],
     site: Scenario,
@@ -236,11 +188,7 @@ def survey_frames(
     on_progress: Callable[[int, int], None] | None = None,
 ) -> SurveyFile:
     """Find what does not change over frames; see `survey`."""
-    commanded = np.concatenate([commanded_normals(site, part.unix_s, simulated=part.simulated) for part in parts])
-    if np.isnan(commanded[:, : len(site.heliostat)]).all():
-        raise ScenarioError(
-            f"scenario `{site.name}` says of no mirror where it was told to point; give [posture] csv, or `normal_enu`"
-        )
+    commanded = commanded_in(parts, site)
     groups = list(mirror_groups(site))
     if len(groups) > 1 and any(t.survey_sigma_m > 0.0 for t in site.transmitter):
         raise ScenarioError(

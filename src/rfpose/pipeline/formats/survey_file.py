@@ -191,6 +191,16 @@ class SurveyFile:
             transmitters.append({**t.model_dump(exclude_none=True), "position_enu_m": place.tolist()})
         return scenario.changed(heliostat=heliostats, transmitter=transmitters, **self._ground(scenario))
 
+    def mounts_of(self, scenario: Scenario) -> SurveyedMounts:
+        """Return the mounts of a scenario's heliostats, in its order; of one that `applied` took."""
+        row = {name: i for i, name in enumerate(self.scenario.heliostat_ids)}
+        pick = [row[h.id] for h in scenario.heliostat]
+        own = self.mounts
+        return SurveyedMounts(
+            undetermined=tuple(own.undetermined[i] for i in pick),
+            **{name: getattr(own, name)[pick] for name in _MOUNT_KEYS},
+        )
+
     def _ground(self, scenario: Scenario) -> dict[str, Any]:
         """Return the tables that the ground's surveyed permittivity changes."""
         table = scenario.reflection

@@ -9,14 +9,15 @@ import numpy as np
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.feedback.correlated import AXES_AND_ZEROS, CorrelatedFit, fit_correlated
-from rfpose.feedback.mount import Mount, command
+from rfpose.feedback.mount import Mount, command, posture
 from rfpose.feedback.selection import PLANNED_SIGMA
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import Survey
+from rfpose.pipeline.formats.survey_file import SurveyedMounts
 from rfpose.pipeline.mirrors import MirrorGroup
 from rfpose.scenario import Scenario
 
-__all__ = ["commanded_counts", "planned_mounts", "surveyed_mounts"]
+__all__ = ["commanded_counts", "normals_by_mounts", "planned_mounts", "surveyed_mounts"]
 
 
 def planned_mounts(scenario: Scenario, given: Mapping[str, Mount] | None) -> list[Mount]:
@@ -73,3 +74,25 @@ def commanded_counts(mounts: list[Mount], normal_enu: FloatArray) -> FloatArray:
         if len(told):
             count[told, i] = command(mount, sun_enu=normal_enu[told, i], mode="dish").count
     return count
+
+
+def normals_by_mounts(mounts: list[Mount], found: SurveyedMounts, commanded_enu: FloatArray) -> FloatArray:
+    """Return where mirrors point (frame, heliostat, xyz) that were told to point somewhere, by surveyed mounts.
+
+    Parameters
+    ----------
+    mounts
+        That control believes in.
+    found
+        What they are off by, in the same order.
+    commanded_enu : (frame, heliostat, xyz)
+        Normals; NaN: unknown.
+    """
+    count = commanded_counts(mounts, commanded_enu)
+    out = np.full(commanded_enu.shape, np.nan)
+    for i, mount in enumerate(mounts):
+        true = mount.replace(**dict(zip(AXES_AND_ZEROS, found.parameter[i].tolist(), strict=True)))
+        told = np.flatnonzero(np.isfinite(count[:, i]).all(axis=1))
+        if len(told):
+            out[told, i] = posture(true, count[told, i]).normal_enu
+    return out

@@ -1,0 +1,106 @@
+"""Frames of recordings of one site, as what carriers tell in them."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rfpose.checks import FloatArray
+from rfpose.errors import ScenarioError
+from rfpose.pipeline.measure import measure_tones
+from rfpose.pipeline.postures import commanded_normals
+from rfpose.pipeline.site.poses import check_site_solvable
+from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.scenario import Scenario
+
+__all__ = ["Frames", "commanded_in", "measured_frames"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frames:
+    """What one recording tells.
+
+    Attributes
+    ----------
+    carrier, sigma : (frame, receiver axis, transmitter)
+        As `rfpose.dsp.TonePhases` has them.
+    unix_s : (frame,)
+        Their middle [s since 1970 UTC]; NaN: unknown.
+    simulated
+        Whether it was simulated: then mirrors follow the simulated sun, not that of the time.
+    """
+
+    carrier: npt.NDArray[np.complex128]
+    sigma: FloatArray
+    unix_s: FloatArray
+    simulated: bool = False
+
+
+def measured_frames(
+    recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool
+) -> tuple[Frames, Scenario]:
+    """Measure the carriers of a recording.
+
+    Parameters
+    ----------
+    recording
+    site
+        None: the recording's own.
+    follow_links
+        See `rfpose.recording.open_recording`.
+
+    Returns
+    -------
+    Frames
+    Scenario
+        The site.
+
+    Raises
+    ------
+    RecordingError
+        It is missing or damaged.
+    ScenarioError
+        No scenario, or one that pose ``site`` cannot solve.
+    """
+    opened: contextlib.AbstractContextManager[Recording] = (
+        contextlib.nullcontext(recording)
+        if isinstance(recording, Recording)
+        else open_recording(recording, follow_links=follow_links)
+    )
+    with opened as one:
+        chosen = one.scenario if site is None else site
+        if chosen is None:
+            raise ScenarioError(f"{one.path}: holds no scenario; describe the site in TOML and give `scenario=FILE`")
+        check_against(one, chosen)
+        check_site_solvable(chosen)
+        starts = frame_starts(one, chosen.radio.frame_samples)
+        if not len(starts):
+            raise ScenarioError(f"{one.path}: no stretch as long as a frame; shorten radio.frame_samples")
+        tones = measure_tones(one, chosen, starts, estimator="hilbert")
+        half = Fraction(chosen.radio.frame_samples, 2)
+        middle = np.array([float((int(s) + half) / one.sample_rate) for s in starts])
+        frames = Frames(
+            carrier=tones.carrier, sigma=tones.carrier_sigma, unix_s=middle, simulated=one.truth is not None
+        )
+        return frames, chosen
+
+
+def commanded_in(parts: list[Frames], site: Scenario) -> FloatArray:
+    """Return where mirrors were told to point in all frames (frame, mirror, xyz).
+
+    Raises
+    ------
+    ScenarioError
+        No heliostat is known to have been told anything.
+    """
+    commanded = np.concatenate([commanded_normals(site, part.unix_s, simulated=part.simulated) for part in parts])
+    if np.isnan(commanded[:, : len(site.heliostat)]).all():
+        raise ScenarioError(
+            f"scenario `{site.name}` says of no mirror where it was told to point; give [posture] csv, or `normal_enu`"
+        )
+    return commanded
