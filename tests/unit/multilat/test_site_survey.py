@@ -8,6 +8,7 @@ from scipy.stats import chi2
 from rfpose import geometry
 from rfpose.multilat.site import (
     Constants,
+    PostureCorrelation,
     ReferencePoses,
     SiteKnowledge,
     SiteObservations,
@@ -188,3 +189,95 @@ def test_a_mirror_without_frames_keeps_what_was_known():
     assert found.rank[1] == 0
     np.testing.assert_array_equal(found.constants.receiver_mirror_m[1], PLACES)
     np.testing.assert_allclose(np.diagonal(found.cov[1]), found.prior_sigma_m**2)
+
+
+class Stray(Site):
+    """A field in which things that nobody foresaw turn what is received, alike in near postures."""
+
+    ANGLE_RAD, SIZE = np.radians(12.0), 0.06
+
+    def __init__(self, seed, prior=PRIOR, n_frame=N_FRAME):
+        super().__init__(seed, prior, n_frame)
+        rng = np.random.default_rng([seed, 1])
+        for m in range(len(PIVOTS)):
+            normal = self.rot[m :: len(PIVOTS), :, 2]
+            angle = np.arccos(np.clip(normal @ normal.T, -1.0, 1.0))
+            lower = np.linalg.cholesky(np.exp(-angle / self.ANGLE_RAD) + 1e-9 * np.eye(n_frame))
+            shape = (n_frame, 3 * len(TRANSMITTERS))
+            stray = lower @ (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+            one = self.seen.carrier[m :: len(PIVOTS)]
+            self.seen.carrier[m :: len(PIVOTS)] = one * (1.0 + self.SIZE * stray.reshape(one.shape))
+
+
+def test_how_errors_go_together_over_posture_is_found():
+    found = Stray(11).survey().correlation
+    # four mirrors with a few independent stretches of thirty links each
+    assert 0.7 * Stray.ANGLE_RAD < found.angle_rad < 1.5 * Stray.ANGLE_RAD
+    assert found.share > 0.8
+    white = Site(11).survey()
+    assert white.correlation.share < 0.1
+    assert np.all(white.n_independent > 0.9 * N_FRAME)
+
+
+WHITE = PostureCorrelation(share=0.0, angle_rad=1.0)
+
+
+def sites_and_surveys(prior, correlation):
+    """Fields of few postures, and what is found in them."""
+    for seed in range(20, 24):
+        site = Stray(seed, prior, n_frame=12)
+        site.prior = replace(prior, correlation=correlation)
+        yield site, site.survey()
+
+
+def nees_of_constants(correlation):
+    """Mean squared errors over what is told."""
+    found = [
+        np.einsum("mp,mpq,mq->m", (e := site.own_errors(one)), np.linalg.inv(one.cov), e) / e.shape[1]
+        for site, one in sites_and_surveys(PRIOR, correlation)
+    ]
+    return np.mean(found)
+
+
+def nees_of_mean_normals(correlation):
+    """The same of a mirror's mean normal, where its receivers are exactly where they are said to be."""
+    exact = replace(PRIOR, place_sigma_m=1e-5, pivot_sigma_m=1e-5)
+    found = []
+    for site, one in sites_and_surveys(exact, correlation):
+        off = np.einsum("mxa,mx->ma", site.rot[:, :, :2], one.poses.normal_enu - site.rot[:, :, 2])
+        for m in range(len(PIVOTS)):
+            mean = off[m :: len(PIVOTS)].mean(axis=0)
+            found.append(mean @ np.linalg.solve(one.normal_cov(m).mean(axis=(0, 2)), mean) / 2.0)
+    return np.mean(found)
+
+
+def test_near_postures_do_not_feign_knowledge():
+    # sixteen mirrors of twelve constants, of whose directions the priors hold half
+    own = nees_of_constants(None)
+    assert 0.6 < own < 1.4
+    assert nees_of_constants(WHITE) > 1.3 * own
+
+
+def test_normals_of_near_postures_have_their_errors_in_common():
+    # thirty-two components: a fourth is one standard deviation
+    mean = nees_of_mean_normals(None)
+    assert 0.4 < mean < 1.7
+    assert nees_of_mean_normals(WHITE) > 1.7 * mean
+
+
+def test_frames_of_one_posture_are_worth_one():
+    normal = np.tile([[0.0, 0.6, 0.8]], (5, 1))
+    normal[4] = [0.6, 0.0, 0.8]
+    alike = PostureCorrelation(share=1.0, angle_rad=0.05)
+    np.testing.assert_allclose(alike.worth(normal), [0.25, 0.25, 0.25, 0.25, 1.0], rtol=1e-5)
+    normal[1] = np.nan
+    np.testing.assert_allclose(alike.worth(normal), [1 / 3, 0.0, 1 / 3, 1 / 3, 1.0], rtol=1e-5)
+    half = PostureCorrelation(share=0.5, angle_rad=0.05)
+    np.testing.assert_allclose(half.worth(normal)[0], 0.5, rtol=1e-5)
+
+
+def test_camera_normals_count_for_themselves_however_near_the_postures():
+    site = Stray(13, n_frame=12)
+    many = site.survey(reference=site.reference(every=1, sigma=1e-3))
+    few = site.survey(reference=site.reference(every=6, sigma=1e-3))
+    assert np.all(many.normal_sigma_rad[:, 1] < few.normal_sigma_rad[:, 1])
