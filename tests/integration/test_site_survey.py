@@ -1,15 +1,23 @@
 """A survey by radio from recordings to the poses that use it, and its file."""
 
+import json
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import h5py
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from scipy.stats import chi2
 
 import rfpose as rf
 from damage import damage_hdf5
-from rfpose.errors import RecordingError, RfposeError, ScenarioError
+from rfpose.cli._app import app
+from rfpose.errors import InvalidInputError, RecordingError, RfposeError, ScenarioError
+from rfpose.feedback.correlated import AXES_AND_ZEROS
+from rfpose.feedback.mount import Mount, command, posture
 from rfpose.pipeline.formats.survey_file import read_survey
+from rfpose.recording import frame_starts
 
 
 @pytest.fixture(scope="module")
@@ -84,15 +92,151 @@ def test_what_was_written_comes_back(surveyed):
     assert rf.__version__ in h5py.File(again).attrs["made_by"]
 
 
-def test_a_survey_of_another_site_is_refused(site, surveyed):
-    found = read_survey(surveyed)
-    other = [{**h.model_dump(exclude_none=True), "id": f"X{k}"} for k, h in enumerate(site.heliostat)]
-    with pytest.raises(ScenarioError, match="another site: it has no heliostat `X0`"):
-        found.applied(site.changed(heliostat=other))
-    east, *rest = site.heliostat[0].pivot_enu_m
-    moved = [{**site.heliostat[0].model_dump(exclude_none=True), "pivot_enu_m": [east + 1.0, *rest]}]
-    with pytest.raises(ScenarioError, match="pivot of heliostat `H01`"):
-        found.applied(site.changed(heliostat=moved))
+def changed(site, i, **keys):
+    """The heliostats of a site, one of them otherwise."""
+    heliostats = [h.model_dump(exclude_none=True) for h in site.heliostat]
+    heliostats[i].update(keys)
+    return site.changed(heliostat=heliostats)
+
+
+OTHERS = {
+    "no heliostat `X0`": lambda site: changed(site, 0, id="X0"),
+    "heliostat `H02` has another number": lambda site: changed(
+        site, 1, receiver_mirror_m=[*site.heliostat[1].receiver_mirror_m, (0.1, 0.2, 0.3)],
+        receiver_ids=[*site.heliostat[1].receiver_ids, "more"],
+    ),
+    "receivers of heliostat `H03`": lambda site: changed(
+        site, 2, receiver_mirror_m=[(x + 0.02, y, z) for x, y, z in site.heliostat[2].receiver_mirror_m]
+    ),
+    "pivot of heliostat `H01`": lambda site: changed(
+        site, 0, pivot_enu_m=tuple(np.add(site.heliostat[0].pivot_enu_m, (1.0, 0.0, 0.0)))
+    ),
+    "no transmitter `Y`": lambda site: site.changed(
+        transmitter=[{**site.transmitter[0].model_dump(exclude_none=True), "id": "Y"}, *site.transmitter[1:]]
+    ),
+    "transmitter `T1` is": lambda site: site.changed(
+        transmitter=[
+            {**site.transmitter[0].model_dump(exclude_none=True), "position_enu_m": (90.0, 1.0, 20.0)},
+            *site.transmitter[1:],
+        ]
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("said", OTHERS)
+def test_a_survey_of_another_site_is_refused(site, recording, surveyed, said):
+    other = OTHERS[said](site)
+    with pytest.raises(ScenarioError, match=f"another site: .*{said}"):
+        read_survey(surveyed).applied(other)
+    if "transmitter" not in said and "number" not in said:
+        with pytest.raises(ScenarioError, match="another site"):
+            rf.process(recording, scenario=other, pose="site", survey=surveyed)
+
+
+# -- mounts --------------------------------------------------------------------------------------------------
+
+
+class Control:
+    """Mounts that are not as planned, and what control, which does not know, makes of the normals that are true."""
+
+    def __init__(self, recording, folder):
+        truth, rng = recording.truth, np.random.default_rng(8)
+        sizes = dict(zip(AXES_AND_ZEROS, (3e-3, 3e-3, 8e-3, 8e-3, 1e-3), strict=True))
+        self.planned = [Mount(pivot_enu_m=p) for p in recording.scenario.pivot_enu_m]
+        self.true = [
+            mount.replace(**{name: size * rng.standard_normal() for name, size in sizes.items()})
+            for mount in self.planned
+        ]
+        self.count = [command(m, sun_enu=truth.normal_enu[:, i], mode="dish").count for i, m in enumerate(self.true)]
+        lines = ["id,frame,normal_e,normal_n,normal_u"]
+        for i, name in enumerate(truth.heliostat_ids):
+            told = posture(self.planned[i], self.count[i]).normal_enu
+            lines += [f"{name},{f},{n[0]},{n[1]},{n[2]}" for f, n in enumerate(told.tolist())]
+        self.csv = folder / "commanded.csv"
+        self.csv.write_text("\n".join(lines))
+
+    def errors(self, found):
+        true = [[mount.parameters[name] for name in AXES_AND_ZEROS] for mount in self.true]
+        return found.mounts.parameter - np.array(true)
+
+
+@pytest.fixture(scope="module")
+def control(recording, tmp_path_factory):
+    return Control(recording, tmp_path_factory.mktemp("control"))
+
+
+@pytest.fixture(scope="module")
+def told_site(site, control):
+    return site.changed(posture={"csv": str(control.csv), "sigma_rad": 0.02})
+
+
+@pytest.fixture(scope="module")
+def with_mounts(told_site, recording, reference):
+    return rf.survey(recording, scenario=told_site, reference=reference)
+
+
+def test_mounts_are_found_within_their_covariance(control, with_mounts):
+    off, cov = control.errors(with_mounts), with_mounts.mounts.cov
+    total = float(np.einsum("mp,mpq,mq->", off, np.linalg.inv(cov), off))
+    assert total < chi2.ppf(1.0 - 1e-3, off.size)
+    assert np.all(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) < 1e-3)
+    assert with_mounts.mounts.rank.tolist() == [5, 5, 5]
+
+
+def test_without_a_reference_pose_a_mount_is_known_as_well_as_its_receivers_are(control, told_site, recording):
+    found = rf.survey(recording, scenario=told_site)
+    zero = AXES_AND_ZEROS.index("axis_2_zero_rad")
+    places = found.normal_sigma_rad[:, 1]
+    assert np.all(np.sqrt(found.mounts.cov[:, zero, zero]) > 0.5 * places)
+    _, now, pointed = found.mounts.normal_sigma_rad.T
+    assert np.all(now > places)
+    assert np.all(pointed < 0.6 * now)
+    off = control.errors(found)
+    total = float(np.einsum("mp,mpq,mq->", off, np.linalg.inv(found.mounts.cov), off))
+    assert total < chi2.ppf(1.0 - 1e-3, off.size)
+
+
+def test_logged_motors_say_the_same_as_commands(control, told_site, recording, reference, with_mounts, tmp_path):
+    starts = frame_starts(recording, told_site.radio.frame_samples)
+    rate = float(recording.sample_rate)
+    lines = ["time_utc,heliostat,axis_1,axis_2"]
+    for i, name in enumerate(told_site.heliostat_ids):
+        for start, count in zip(starts.tolist(), control.count[i].tolist(), strict=True):
+            at = datetime.fromtimestamp((start + 0.5 * told_site.radio.frame_samples) / rate, UTC).isoformat()
+            lines.append(f"{at},{name},{1e3 * count[0]},{1e3 * count[1]}")
+    motors = tmp_path / "motors.csv"
+    motors.write_text("\n".join(lines))
+    mounts = tmp_path / "planned.toml"
+    text = 'format = "rfpose-mount"\nversion = 1\n'
+    for h in told_site.heliostat:
+        drives = "actuators = [{counts_per_unit = 1000.0}, {counts_per_unit = 1000.0}]"
+        text += f"[heliostat.{h.id}]\npivot_enu_m = {list(h.pivot_enu_m)}\n{drives}\n"
+    mounts.write_text(text)
+    found = rf.survey(recording, scenario=told_site, reference=reference, mounts=mounts, motors=motors)
+    np.testing.assert_allclose(found.mounts.parameter, with_mounts.mounts.parameter, atol=1e-6)
+    with pytest.raises(InvalidInputError, match=r"give `mounts=FILE`"):
+        rf.survey(recording, scenario=told_site, motors=motors)
+    motors.write_text("\n".join(lines).replace("H0", "K0"))
+    with pytest.raises(RecordingError, match=r"motors\.csv: has no entry of the site's heliostats"):
+        rf.survey(recording, scenario=told_site, mounts=mounts, motors=motors)
+    mounts.write_text(text.replace("H02", "K02"))
+    with pytest.raises(ScenarioError, match="lack heliostat `H02`"):
+        rf.survey(recording, scenario=told_site, mounts=mounts)
+
+
+def test_one_posture_leaves_most_undetermined_and_says_so(site, tmp_path):
+    short = site.changed(simulation={"frame_count": 1, "sun_azimuth_deg": 150.0, "sun_elevation_deg": 40.0})
+    rf.simulate(short, seed=3).save(tmp_path / "one.h5")
+    run = CliRunner().invoke(app, ["survey", str(tmp_path / "one.h5"), "-o", str(tmp_path / "s.h5"), "--json"])
+    assert run.exit_code == 0, run.output
+    report = json.loads(run.stdout)["heliostats"]["H01"]
+    assert (report["frames"], report["mount"]["rank"]) == (1, 2)
+    assert report["mount"]["scatter"] is None
+    assert any("nonorthogonality_rad" in words for words in report["mount"]["undetermined"])
+    assert any("rotation of the receivers" in words for words in report["undetermined"])
+    run = CliRunner().invoke(app, ["survey", str(tmp_path / "one.h5"), "-o", str(tmp_path / "s.h5"), "--force"])
+    assert run.exit_code == 0, run.output
+    assert "3 heliostats, of the mount not determined" in run.output
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -97,23 +100,46 @@ def command(
         emit_json({"survey": output, **report})
         return
     rows = [
-        [name, str(one["frames"]), str(one["rank"]), *(f"{x:.3f}" for x in one["normal_sigma_mrad"].values())]
+        [
+            name,
+            f"{one['frames']} ({one['frames_worth']:.1f})",
+            str(one["rank"]),
+            *(f"{x:.3f}" for x in one["normal_sigma_mrad"].values()),
+        ]
         for name, one in report["heliostats"].items()
     ]
-    header = ["", "frames", "rank", "before", "now", "+ reference pose", "+ receiver surveyed"]
+    header = ["", "frames (worth)", "rank", "before", "now", "+ reference pose", "+ receiver surveyed"]
     table("Normal's error from places [mrad]", header, rows)
-    by_words: dict[tuple[str, ...], int] = {}
-    for one in report["heliostats"].values():
-        words = tuple(one["undetermined"])
-        by_words[words] = by_words.get(words, 0) + 1
-    for words, count in by_words.items():
-        for word in words:
-            say(f"  {count} heliostats, not determined: {word}")
-    if any("rotation of the receivers" in word for words in by_words for word in words):
+    mounts = {name: one["mount"] for name, one in report["heliostats"].items()}
+    table("Mounts: what they are off by, and sigma [mrad]; error of their normals", _MOUNT_HEADER, [
+        [name, *(_found(one, key) for key in one["parameters"]), *(_mrad(x) for x in one["normal_sigma_mrad"].values())]
+        for name, one in mounts.items()
+    ])  # fmt: skip
+    by_words = _counted(one["undetermined"] for one in report["heliostats"].values())
+    for word, count in by_words.items():
+        say(f"  {count} heliostats, not determined: {word}")
+    for word, count in _counted(one["undetermined"] for one in mounts.values()).items():
+        say(f"  {count} heliostats, of the mount not determined: {word}")
+    if any("rotation of the receivers" in word for word in by_words):
         say(
-            "  radio alone does not tell how receivers are turned against the plate; "
-            "a reference pose would (--reference)"
+            "  radio alone does not tell how receivers are turned against the plate, which the mounts' zeros have in "
+            "them; a reference pose would (--reference)"
         )
     for word in report["transmitters_undetermined"]:
         say(f"  not determined: {word}")
     say(f"wrote {output}")
+
+
+_MOUNT_HEADER = ["", "tilt north", "tilt east", "zero 1", "zero 2", "square", "before", "now", "+ reference pose"]
+
+
+def _found(mount: dict[str, Any], key: str) -> str:
+    return f"{1e3 * mount['parameters'][key]:.2f} ± {1e3 * mount['sigma'][key]:.2f}"
+
+
+def _mrad(value: float | None) -> str:
+    return "" if value is None else f"{value:.3f}"
+
+
+def _counted(lists: Iterable[list[str]]) -> Counter[str]:
+    return Counter(word for words in lists for word in words)

@@ -122,7 +122,7 @@ def test_normals_that_scatter_more_than_told_widen_the_covariance():
     [
         ({"prior_sigma": {}}, "`prior_sigma` must name one parameter"),
         ({"prior_sigma": {"axis_1_zero_rad": 0.0}}, "sigma above zero"),
-        ({"cov_rad2": np.zeros((N, 2, N, 2))}, "not positive definite"),
+        ({"cov_rad2": -np.ones((N, 2, N, 2))}, "not positive definite"),
         ({"count": np.zeros((N - 1, 2))}, "`count`"),
     ],
 )

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
+from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.site import _kernels
 from rfpose.multilat.site.correlation import PostureCorrelation, found_correlation
 from rfpose.multilat.site.fit import (
@@ -187,7 +188,7 @@ class Survey:
         Returns
         -------
         (frame, xy, frame, xy)
-            Of the components along the mirror's x and y [rad²]. NaN: frames without a pose.
+            Of the components along x and y of a mirror whose x axis lies level [rad²]. NaN: frames without a pose.
 
         Notes
         -----
@@ -205,8 +206,9 @@ class Survey:
         by_constant = self.turn_by_constant[own]
         out += np.einsum("fap,pq,gbq->fagb", by_constant, self.cov[mirror], by_constant)
         # a turn w moves the normal z by w x z: along x by the turn about y, along y by minus that about x
-        moved = np.array([[0.0, 1.0], [-1.0, 0.0]])
-        return np.asarray(np.einsum("ac,fcgd,bd->fagb", moved, out, moved))
+        across = rot_enu_from_mirror(np.where(known[:, None], normal, [0.0, 0.0, 1.0]))[:, :, :2]
+        moved = np.einsum("fxa,fxb,bc->fac", across, rot[:, :, :2], np.array([[0.0, 1.0], [-1.0, 0.0]]))
+        return np.asarray(np.einsum("fac,fcgd,gbd->fagb", moved, out, moved))
 
 
 CASES = ("before", "now", "one reference pose more", "one receiver surveyed")

@@ -171,7 +171,7 @@ class SurveyFile:
                 raise ScenarioError(f"the survey is of another site: it has no heliostat `{h.id}`; survey this site")
             i, n = row[h.id], len(h.receiver_mirror_m)
             places = self.receiver_mirror_m[i, :n]
-            if np.isnan(places).any() or np.isfinite(self.receiver_mirror_m[i, n:]).any():
+            if len(places) < n or np.isnan(places).any() or np.isfinite(self.receiver_mirror_m[i, n:]).any():
                 raise ScenarioError(
                     f"the survey is of another site: heliostat `{h.id}` has another number of receivers there"
                 )
