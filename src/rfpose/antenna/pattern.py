@@ -21,7 +21,7 @@ MISSING_SIGMA = 1.0
 
 _PLACE_WAVELENGTHS = 0.05
 _FEWEST = (4, 6)
-_BEYOND = 0.02  # of a frequency: so far outside the table its end still holds
+BEYOND = 0.02  # of a frequency: so far outside the table its end still holds
 _LARGEST = 1e3
 _DIPOLE_STEP_DEG = 6.0
 
@@ -153,7 +153,7 @@ class AntennaPattern:
         """
         wanted = as_positive("frequency_hz", frequency_hz)
         known = self.frequency_hz
-        if not known[0] * (1.0 - _BEYOND) <= wanted <= known[-1] * (1.0 + _BEYOND):
+        if not known[0] * (1.0 - BEYOND) <= wanted <= known[-1] * (1.0 + BEYOND):
             raise InvalidInputError(
                 f"the antenna pattern holds from {known[0] / 1e6:.6g} to {known[-1] / 1e6:.6g} MHz, and "
                 f"{wanted / 1e6:.6g} MHz is asked for; give a pattern of that frequency"

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from rfpose.antenna import LearnedPattern, MirrorType, PostureCarriers
 from rfpose.antenna import learn_pattern as learn_from_carriers
+from rfpose.antenna.pattern import BEYOND
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.files import claim
@@ -114,7 +115,7 @@ def learn_from_frames(
 ) -> LearnedPattern:
     """Learn a pattern from frames; see `learn_pattern`."""
     mirror = _mirror_type(site)
-    frequency_hz = site.radio.centre_frequency_hz
+    frequency_hz = _frequency_hz(site)
     near = None if start is None else read_pattern(start).pattern
     commanded = commanded_in(parts, site)
     sigma_rad = site.posture.sigma_rad
@@ -190,6 +191,18 @@ def _mirror_type(site: Scenario) -> MirrorType:
         axis_mirror=np.array(site.antenna.axis_mirror),
         plate_m=(first.width_m, first.height_m),
     )
+
+
+def _frequency_hz(site: Scenario) -> float:
+    """Return the middle of the carriers, which a pattern of one frequency must hold for."""
+    low, high = float(site.carrier_rf_hz.min()), float(site.carrier_rf_hz.max())
+    middle = 0.5 * (low + high)
+    if high > middle * (1.0 + BEYOND):
+        raise ScenarioError(
+            f"the carriers of scenario `{site.name}` reach from {low / 1e6:.6g} to {high / 1e6:.6g} MHz, and a learned "
+            f"pattern holds within {100.0 * BEYOND:.0f} % of its frequency; make one with scripts/antenna_pattern.py"
+        )
+    return middle
 
 
 def _new_postures(normal_enu: FloatArray) -> IntArray:
