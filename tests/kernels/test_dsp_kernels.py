@@ -73,11 +73,34 @@ def test_turn_back_and_turn_are_inverse_rotations():
     rng = np.random.default_rng(3)
     block = rng.standard_normal((9, 4)).astype(np.float32)
     cycles = np.array([0.3, -1.7])
-    expected = (block[:, :2] + 1j * block[:, 2:]).T * np.exp(-2j * np.pi * np.outer(cycles, np.arange(9)))
-    for _, found in both(_kernels.turn_back, block, cycles, np.empty((2, 9), np.complex128)):
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+    plain = (block[:, :2] + 1j * block[:, 2:]).T
+    expected = plain * np.exp(-2j * np.pi * np.outer(cycles, np.arange(9)))
+    for kernel in (_kernels.turn_back, _kernels.turn_back.py_func):
+        out, tail = np.empty((2, 9), np.complex128), np.empty(2, np.complex128)
+        kernel(block, cycles, out, tail)
+        np.testing.assert_allclose(out, expected, atol=1e-12)
+        np.testing.assert_array_equal(tail, 0.0)
+        # one block more than there is room for is the tail
+        out = np.empty((2, 8), np.complex128)
+        kernel(block, cycles, out, tail)
+        np.testing.assert_allclose(np.column_stack([out, tail]), expected, atol=1e-12)
     for _, found in both(_kernels.turn, expected, cycles, np.empty((2, 9), np.complex128)):
-        np.testing.assert_allclose(found, (block[:, :2] + 1j * block[:, 2:]).T, atol=1e-12)
+        np.testing.assert_allclose(found, plain, atol=1e-12)
+
+
+@pytest.mark.parametrize("n_group", [1, 3])
+def test_groups_are_sums_of_turned_blocks(n_group):
+    rng = np.random.default_rng(11)
+    stream, tail = (rng.standard_normal((2, n)) + 1j * rng.standard_normal((2, n)) for n in (10, 1))
+    cycles = np.array([0.013, -0.4])
+    turned = np.column_stack([stream, tail]) * np.exp(2j * np.pi * np.outer(cycles, np.arange(11)))
+    n_part = 10 // n_group
+    parts = turned[:, : n_part * n_group].reshape(2, n_part, n_group).sum(axis=2)
+    for kernel in (_kernels.group_lines, _kernels.group_lines.py_func):
+        sums, grouped = np.empty(2, np.complex128), np.empty((2, n_part), np.complex128)
+        kernel(stream, tail[:, 0], cycles, n_group, sums, grouped)
+        np.testing.assert_allclose(grouped, parts, atol=1e-12)
+        np.testing.assert_allclose(sums, turned.sum(axis=1), atol=1e-12)
 
 
 def test_most_coherent_is_where_lines_add_up():
@@ -151,16 +174,17 @@ def test_model_and_residual_of_known_lines():
         unit = [sums_of_unit_line(c, c, t, hop, n_sample) for c, t in zip(cycles, template, strict=True)]
         np.testing.assert_allclose(own, unit, atol=1e-9)
         leaked, span, scatter = group @ model, hop * n_group, np.empty(2)
-        slope = 2.0 * np.pi * np.array([1e-4, -2e-4]) * model[:, 0]
+        turn = 2.0 * np.pi * np.array([1e-4, -2e-4])
+        slope, first_model = turn * model[:, 0], model[:, 0].copy()
         first = 0.5 * span - 0.5 - centre
-        step, _ = moments(stream, leaked, cycles * span, slope, first, span, scatter)
+        step, _ = moments(stream, leaked, cycles * span, first_model, turn, first, span, scatter)
         np.testing.assert_allclose(scatter, 0.0, atol=1e-18)
         assert step == pytest.approx(0.0, abs=1e-9)
         # lines that turn by what a hundredth of a ppm makes ask for just that
         back = np.exp(-2j * np.pi * np.outer(cycles * span, np.arange(4)))
         lever = first + span * np.arange(4)
         moved = stream + 0.01j * (slope[:, None] * lever)
-        step, power = moments(moved, leaked, cycles * span, slope, first, span, scatter)
+        step, power = moments(moved, leaked, cycles * span, first_model, turn, first, span, scatter)
         assert step == pytest.approx(0.01, rel=1e-6)
         assert power == pytest.approx(np.sum(np.abs(slope) ** 2) * np.sum(lever**2))
         # after that step nothing is left but rounding
@@ -213,25 +237,55 @@ def test_tone_quality_marks_weak_tones_and_absent_carriers():
         np.testing.assert_allclose(sigma[:, 0], [np.sqrt(0.5 / 36.0 + 0.01), np.nan, np.nan])
 
 
-@pytest.mark.parametrize("n_fold", [4, 5])
-def test_flat_fold_turns_rows_and_inspects(n_fold):
-    rng = np.random.default_rng(9)
-    period, n_block, n_tail, shift = 8, 3, 5, 0.013
-    samples = rng.integers(-1000, 1000, (period * n_fold * n_block + n_tail, 2)).astype(np.int16)
+def spoiled(rng, n_sample):
+    """Samples of which two are clipped, one is filled and a stretch is zero; and as complex numbers."""
+    samples = rng.integers(-1000, 1000, (n_sample, 2)).astype(np.int16)
     samples[3] = 2000, 0
     samples[40] = -32768, -32768
     samples[64:80] = 0
     samples[-1] = 0, -3000
-    x = samples[:, 0] + 1j * samples[:, 1].astype(float)
-    row = np.exp(-2j * np.pi * shift * period * np.arange(n_fold)) * 2.0**-16
+    return samples, samples[:, 0] + 1j * samples[:, 1].astype(float)
+
+
+def turns(shift, period, n_fold):
+    """Turns of rows, with the kernels' factor, and inside a row; and the same as one factor a sample."""
+    row = np.exp(-2j * np.pi * shift * period * np.arange(n_fold))
     ramp = np.exp(-2j * np.pi * shift * np.arange(period))
-    turned = x[: period * n_fold * n_block].reshape(n_block, n_fold, period) * (row[:, None] * ramp * 2.0**16)
-    expected = turned.sum(axis=1)
-    turns = [part.astype(np.float32) for z in (row, ramp) for part in (z.real, z.imag)]
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *turns, n_block, np.int16(2000), 16
-    for found, out in both(_kernels.fold_flat_i16, *arguments, np.empty((n_block, 2 * period), np.float32)):
-        assert found == (2, 1, 16)
-        np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+    parts = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
+    return parts, np.multiply.outer(row, ramp).ravel()
+
+
+@pytest.mark.parametrize("n_fold", [4, 5])
+@pytest.mark.parametrize("n_tail", [0, 5, 13, 21])
+def test_flat_fold_turns_rows_and_inspects(n_fold, n_tail):
+    period, n_block = 8, 3
+    n_tap = period * n_fold
+    samples, x = spoiled(np.random.default_rng(9), n_tap * n_block + n_tail)
+    parts, turn = turns(0.013, period, n_fold)
+    n_row = n_block + (n_tail > 0)
+    whole = np.concatenate([x, np.zeros(n_row * n_tap - len(x))])  # the last block may be cut short
+    expected = (whole.reshape(n_row, n_tap) * turn).reshape(n_row, n_fold, period).sum(axis=1)
+    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_row, np.int16(2000), 16
+    for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
+        for found, out in both(_kernels.fold_flat_i16, *arguments, n_seen, np.empty((n_row, 2 * period), np.float32)):
+            assert found == counts
+            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+
+
+@pytest.mark.parametrize("n_half", [2, 3])
+def test_hann_fold_is_what_weights_sample_by_sample_give(n_half):
+    period, n_block = 8, 6
+    hop, n_tap = n_half * period, 2 * n_half * period
+    samples, x = spoiled(np.random.default_rng(10), hop * (n_block + 1) + 5)
+    parts, turn = turns(0.013, period, 2 * n_half)
+    weight = turn * (0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(n_tap) + 0.5) / n_tap))
+    windows = np.array([x[k * hop : k * hop + n_tap] * weight for k in range(n_block)])
+    expected = windows.reshape(n_block, 2 * n_half, period).sum(axis=1)
+    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_block, np.int16(2000), 16
+    for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
+        for found, out in both(_kernels.fold_hann_i16, *arguments, n_seen, np.empty((n_block, 2 * period), np.float32)):
+            assert found == counts
+            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
 
 
 def test_smooth_variance_of_equal_lines_is_their_mean():

@@ -111,12 +111,13 @@ def _add_two_rows_i16(x0, x1, a0, c0, a1, c1, re, im):
 
 
 @kernel_fast
-def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, out):
+def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
     """Fold and inspect in one pass over memory: blocks side by side, each row of a period turned as a whole.
 
     ``flat`` (2·sample,) int16 and ``pair`` (sample,) int32 are the same samples; ``row_re``, ``row_im`` (fold,)
     turn row by row and carry a factor 2⁻¹⁶, ``ramp_re``, ``ramp_im`` (period,) turn what is left inside a row.
-    ``out`` (block, 2·period). Returns (clipped, fill, samples in all-zero segments), of the whole frame.
+    ``out`` (block, 2·period); the last block may be cut short. Returns (clipped, fill, samples in all-zero segments) of
+    all samples but the first ``n_seen``.
     """
     n_fold = row_re.size
     period = ramp_re.size
@@ -124,7 +125,7 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
     clipped = 0
     fill = 0
     zero = 0
-    looked = 0
+    looked = n_seen
     for k in range(n_block):
         for j in range(2 * period):
             out[k, j] = 0.0
@@ -140,16 +141,146 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
                 fill += f
                 zero += z
                 looked = ahead
-            x = pair[first : first + period]
-            if r + 1 < n_fold:
+            if r + 1 < n_fold and end <= n_sample:
+                x = pair[first : first + period]
                 after = pair[first + period : end]
                 _add_two_rows_i16(x, after, row_re[r], row_im[r], row_re[r + 1], row_im[r + 1], re, im)
-            else:
-                _add_row_i16(x, row_re[r], row_im[r], re, im)
+                continue
+            for one in range(r, min(r + 2, n_fold)):
+                first = min((k * n_fold + one) * period, n_sample)
+                _add_row_i16(pair[first : min(first + period, n_sample)], row_re[one], row_im[one], re, im)
         for j in range(period):
             turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
             im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
             re[j] = turned
+    while looked < n_sample:
+        ahead = min(looked + segment, n_sample)
+        c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
+        clipped += c
+        fill += f
+        zero += z
+        looked = ahead
+    return clipped, fill, zero
+
+
+@kernel_inline
+def _add_hann_row_i16(x, a, c, cosine, sine, sums):
+    """Add one row, turned by a + jc, to the plain sum and to those under a cosine and a sine."""
+    for j in range(x.size):
+        v = x[j]
+        i = np.float32(np.int32(v << np.int32(16)))
+        q = np.float32(np.int32(v & np.int32(-65536)))
+        re = i * a - q * c
+        im = i * c + q * a
+        sums[0, j] += re
+        sums[1, j] += im
+        sums[2, j] += cosine * re
+        sums[3, j] += cosine * im
+        sums[4, j] += sine * re
+        sums[5, j] += sine * im
+
+
+@kernel_inline
+def _add_two_hann_rows_i16(x0, x1, a0, c0, a1, c1, cosine0, sine0, cosine1, sine1, sums):
+    """Like `_add_hann_row_i16` for two rows: the sums are loaded and stored half as often."""
+    for j in range(x0.size):
+        v0 = x0[j]
+        v1 = x1[j]
+        i0 = np.float32(np.int32(v0 << np.int32(16)))
+        q0 = np.float32(np.int32(v0 & np.int32(-65536)))
+        i1 = np.float32(np.int32(v1 << np.int32(16)))
+        q1 = np.float32(np.int32(v1 & np.int32(-65536)))
+        re0 = i0 * a0 - q0 * c0
+        im0 = i0 * c0 + q0 * a0
+        re1 = i1 * a1 - q1 * c1
+        im1 = i1 * c1 + q1 * a1
+        sums[0, j] += re0 + re1
+        sums[1, j] += im0 + im1
+        sums[2, j] += cosine0 * re0 + cosine1 * re1
+        sums[3, j] += cosine0 * im0 + cosine1 * im1
+        sums[4, j] += sine0 * re0 + sine1 * re1
+        sums[5, j] += sine0 * im0 + sine1 * im1
+
+
+@kernel_fast
+def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
+    """Fold under Hann windows that cover each sample twice, and inspect, in one pass over memory.
+
+    As `fold_flat_i16`, with ``row_re``, ``row_im`` (fold,) of a whole window and ``n_block`` windows. With
+    ``A_r + B_j`` the window's angle at sample j of row r, its cosine is ``cos A_r cos B_j − sin A_r sin B_j``: half a
+    window is added up three times, plain, under ``cos A`` and under ``sin A``; in its second half, half a turn later,
+    the same sums belong to the window before with the other sign.
+    """
+    n_half = row_re.size // 2
+    period = ramp_re.size
+    n_sample = pair.size
+    turn_half = 2.0 * math.pi / (2 * n_half)
+    within_cos = np.empty(period, np.float32)
+    within_sin = np.empty(period, np.float32)
+    for j in range(period):
+        angle = turn_half * (j + 0.5) / period
+        within_cos[j] = 0.5 * math.cos(angle)
+        within_sin[j] = 0.5 * math.sin(angle)
+    cosine = np.empty(n_half, np.float32)
+    sine = np.empty(n_half, np.float32)
+    for r in range(n_half):
+        cosine[r] = math.cos(turn_half * r)
+        sine[r] = math.sin(turn_half * r)
+    # of the second half against the first
+    scale = np.float32(1.0) / (row_re[0] * row_re[0] + row_im[0] * row_im[0])
+    on_re = (row_re[n_half] * row_re[0] + row_im[n_half] * row_im[0]) * scale
+    on_im = (row_im[n_half] * row_re[0] - row_re[n_half] * row_im[0]) * scale
+    two = np.empty((2, 6, period), np.float32)
+    clipped = 0
+    fill = 0
+    zero = 0
+    looked = n_seen
+    for s in range(n_block + 1):
+        now = two[s % 2]
+        now[:] = np.float32(0.0)
+        for r in range(0, n_half, 2):
+            first = (s * n_half + r) * period
+            end = first + 2 * period
+            while looked < min(end, n_sample):
+                ahead = min(looked + segment, n_sample)
+                c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
+                clipped += c
+                fill += f
+                zero += z
+                looked = ahead
+            x = pair[first : first + period]
+            if r + 1 < n_half:
+                _add_two_hann_rows_i16(
+                    x,
+                    pair[first + period : end],
+                    row_re[r],
+                    row_im[r],
+                    row_re[r + 1],
+                    row_im[r + 1],
+                    cosine[r],
+                    sine[r],
+                    cosine[r + 1],
+                    sine[r + 1],
+                    now,
+                )
+            else:
+                _add_hann_row_i16(x, row_re[r], row_im[r], cosine[r], sine[r], now)
+        if s == 0:
+            continue
+        before = two[(s - 1) % 2]
+        for j in range(period):
+            flat_re = now[0, j] * on_re - now[1, j] * on_im
+            flat_im = now[0, j] * on_im + now[1, j] * on_re
+            cos_re = now[2, j] * on_re - now[3, j] * on_im
+            cos_im = now[2, j] * on_im + now[3, j] * on_re
+            sin_re = now[4, j] * on_re - now[5, j] * on_im
+            sin_im = now[4, j] * on_im + now[5, j] * on_re
+            re = np.float32(0.5) * (before[0, j] + flat_re)
+            im = np.float32(0.5) * (before[1, j] + flat_im)
+            re += within_sin[j] * (before[4, j] - sin_re) - within_cos[j] * (before[2, j] - cos_re)
+            im += within_sin[j] * (before[5, j] - sin_im) - within_cos[j] * (before[3, j] - cos_im)
+            out[s - 1, j] = re * ramp_re[j] - im * ramp_im[j]
+            out[s - 1, period + j] = re * ramp_im[j] + im * ramp_re[j]
     while looked < n_sample:
         ahead = min(looked + segment, n_sample)
         c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
@@ -248,7 +379,7 @@ def _power_at(stream, cycles_hop, offset):
 
 @kernel_fast
 def most_coherent(stream, every, n_group, cycles_per_ppm_hop, n_side, step):
-    """Offset [ppm] at which carriers add up to most power: the best of ±``n_side`` steps, then two parabolas.
+    """Offset [ppm] at which carriers add up to most power: the best of ±``n_side`` steps, then parabolas.
 
     ``stream`` (line, block) already turned back by the nominal frequencies, of which each ``every``-th line is a
     carrier and ``n_group`` blocks are added up first; ``cycles_per_ppm_hop`` (carrier,) cycles it turns a group for
@@ -273,7 +404,7 @@ def most_coherent(stream, every, n_group, cycles_per_ppm_hop, n_side, step):
     curvature = math.nan
     small = 0.1 * step
     if n_part > 1:
-        for _ in range(2):
+        for _ in range(4):
             below = _power_at(carrier, cycles_per_ppm_hop, offset - small)
             here = _power_at(carrier, cycles_per_ppm_hop, offset)
             above = _power_at(carrier, cycles_per_ppm_hop, offset + small)
@@ -329,14 +460,20 @@ def _phasors(cycles_hop, n_block, out):
 
 
 @kernel
-def turn_back(block, cycles_hop, out):
-    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128."""
+def turn_back(block, cycles_hop, out, tail):
+    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128.
+
+    One block more than ``out`` takes is the frame's tail, and goes to ``tail`` (line,).
+    """
     n_line, n_block = out.shape
-    phasor = np.empty(n_block, np.complex128)
+    phasor = np.empty(n_block + 1, np.complex128)
     for m in range(n_line):
-        _phasors(-cycles_hop[m], n_block, phasor)
+        _phasors(-cycles_hop[m], n_block + 1, phasor)
         for k in range(n_block):
             out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor[k]
+        tail[m] = 0.0
+        if block.shape[0] > n_block:
+            tail[m] = complex(block[n_block, m], block[n_block, n_line + m]) * phasor[n_block]
 
 
 @kernel
@@ -348,6 +485,26 @@ def turn(stream, cycles_hop, out):
         _phasors(cycles_hop[m], n_block, phasor)
         for k in range(n_block):
             out[m, k] = stream[m, k] * phasor[k]
+
+
+@kernel
+def group_lines(stream, tail, cycles_hop, n_group, sums, grouped):
+    """Turn (line, block) on by ``cycles_hop`` a block and add it up: over the frame with its tail, and over groups."""
+    n_line, n_block = stream.shape
+    n_part = grouped.shape[1]
+    phasor = np.empty(n_block + 1, np.complex128)
+    for m in range(n_line):
+        _phasors(cycles_hop[m], n_block + 1, phasor)
+        total = tail[m] * phasor[n_block]
+        for k in range(n_part):
+            part = 0.0j
+            for i in range(k * n_group, (k + 1) * n_group):
+                part += stream[m, i] * phasor[i]
+            grouped[m, k] = part
+            total += part
+        for i in range(n_part * n_group, n_block):
+            total += stream[m, i] * phasor[i]
+        sums[m] = total
 
 
 @kernel
@@ -375,11 +532,12 @@ def model_of_lines(sums, inverse, cycles, inside_cycles, hop, n_block, n_tail, n
 
 
 @kernel
-def residual_moments(stream, model, cycles_span, slope, first_middle, span, scatter):
+def residual_moments(stream, model, cycles_span, first, slope, first_middle, span, scatter):
     """Power that ``model`` leaves of ``stream`` (line, group) at each line, and how it asks the clock to move.
 
-    The model is in absolute time, the stream turned back by ``cycles_span`` a group. ``slope`` (line,) is what a ppm
-    adds to the first group for each sample from the centre; groups' middles lie ``first_middle`` + k·``span`` from it.
+    The model is in absolute time, the stream turned back by ``cycles_span`` a group. ``slope`` (line,) is how far a ppm
+    turns a line in a sample [rad], ``first`` (line,) what a line puts into the first group; groups' middles lie
+    ``first_middle`` + k·``span`` samples from the centre.
     ``scatter`` (line,) sums squares as they are after the step. Returns the Gauss-Newton step [ppm] and its weight.
     """
     n_line, n_part = stream.shape
@@ -398,8 +556,8 @@ def residual_moments(stream, model, cycles_span, slope, first_middle, span, scat
             square += left.real * left.real + left.imag * left.imag
             moment += left * (first_middle + k * span)
         scatter[m] = square
-        along[m] = (slope[m].conjugate() * moment).imag
-        weight[m] = (slope[m].real ** 2 + slope[m].imag ** 2) * lever
+        along[m] = slope[m] * (first[m].conjugate() * moment).imag
+        weight[m] = slope[m] ** 2 * (first[m].real ** 2 + first[m].imag ** 2) * lever
     power = weight.sum()
     step = along.sum() / power if power > 0.0 else 0.0
     for m in range(n_line):

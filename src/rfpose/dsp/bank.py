@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +40,8 @@ _HANN_GAP_BINS = 40.0
 _LONGEST_BLOCK = 1600
 _LONGEST_FOLDED_BLOCK = 16384
 _ZERO_SEGMENT = 256
-_MAX_TILE_VALUES = 2**22  # float32 values of folded blocks held at a time
+_TILE_VALUES, _MIN_TILE = 2**16, 32  # float32 values of folded blocks held at a time, which should fit the cache
+_MAX_FOLDS = 512  # clock offsets whose turns are kept
 
 
 class Inspection(NamedTuple):
@@ -49,6 +52,13 @@ class Inspection(NamedTuple):
     zero: int
     not_finite: int
 
+    def added(self, other: Inspection) -> Inspection:
+        """Return the counts of both."""
+        return Inspection(*map(add, self, other))
+
+
+NOTHING_WRONG = Inspection(0, 0, 0, 0)
+
 
 class ClockRange(NamedTuple):
     """How far a receiver's clock may be off, and how far from where it is assumed [ppm]."""
@@ -57,8 +67,8 @@ class ClockRange(NamedTuple):
     error_ppm: float
 
 
-Fold = Callable[[Samples, int, npt.NDArray[np.float32]], Inspection]
-"""Folds (sample, 2) into (block, 2·period); what it inspects on the way."""
+Fold = Callable[[Samples, int, int, npt.NDArray[np.float32]], Inspection]
+"""Folds (sample, 2), of which the first so many were inspected before, into so many rows of (block, 2·period)."""
 
 
 def inspect(samples: Samples, full_scale: float) -> Inspection:
@@ -83,6 +93,8 @@ class LineStreams:
         The same for the samples after the last whole block (boxcar only, else zero).
     hop, n_tap, n_tail, n_sample
         Block spacing, block length, length of the tail, length of the frame [samples].
+    clock_ppm
+        The clock offset assumed when the samples were separated [ppm].
     cycles : (line,)
         Frequency of each line at the assumed clock [cycles/sample].
     shift_cycles, template_cycles : scalar, (line,)
@@ -99,6 +111,7 @@ class LineStreams:
     n_tap: int
     n_tail: int
     n_sample: int
+    clock_ppm: float
     cycles: FloatArray
     shift_cycles: float
     template_cycles: FloatArray
@@ -175,12 +188,13 @@ class LineBank:
         self.hop = self.n_tap // overlap
         self.n_block = (n_sample - self.n_tap) // self.hop + 1
         self.n_tail = 0 if windowed else n_sample - self.n_block * self.hop
-        self._template = plan.line_hz / plan.sample_rate_hz
-        self._matrix = _line_matrix(self._template, self.period)
+        self.template_cycles = plan.line_hz / plan.sample_rate_hz
+        self._matrix = _line_matrix(self.template_cycles, self.period)
         n = np.arange(self.n_tap)
         self._envelope = np.sum(
             [a * np.cos(2.0 * np.pi * h * (n + 0.5) / n.size) for h, a in enumerate(self.window)], 0
         )
+        self._fold = lru_cache(maxsize=_MAX_FOLDS)(self._fold_at)
 
     def streams(self, samples: Samples, clock_ppm: float) -> LineStreams:
         """Separate one frame.
@@ -194,26 +208,20 @@ class LineBank:
         """
         cycles = self.plan.line_cycles(clock_ppm)
         shift = self.plan.common_shift_cycles(clock_ppm)
-        fold = self._flat_fold(shift) if self._is_flat(samples) else self._weighted_fold(shift)
-        n_line = len(cycles)
-        blocks = np.empty((self.n_block, 2 * n_line), np.float32)
-        tile = min(self.n_block, max(1, _MAX_TILE_VALUES // (2 * self.period)))
+        fold = self._fold(shift)
+        n_line, n_row = len(cycles), self.n_block + (self.n_tail > 0)
+        blocks = np.empty((n_row, 2 * n_line), np.float32)
+        tile = min(n_row, max(_MIN_TILE, _TILE_VALUES // (2 * self.period)))
         folded = np.empty((tile, 2 * self.period), np.float32)
-        counts = np.zeros(4, np.int64) if self._is_flat(samples) else np.array(inspect(samples, self.full_scale))
-        for first in range(0, self.n_block, tile):
-            count = min(tile, self.n_block - first)
-            end = (first + count) * self.hop if first + count < self.n_block else self.n_sample
-            counts += fold(samples[first * self.hop : end], count, folded)
+        counts = NOTHING_WRONG if self.inspects(samples) else inspect(samples, self.full_scale)
+        for first in range(0, n_row, tile):
+            count = min(tile, n_row - first)
+            end = self.n_sample if first + count == n_row else (first + count - 1) * self.hop + self.n_tap
+            n_seen = self.n_tap - self.hop if first else 0
+            counts = counts.added(fold(samples[first * self.hop : end], n_seen, count, folded))
             np.matmul(folded[:count], self._matrix, out=blocks[first : first + count])
-        stream = np.empty((n_line, self.n_block), np.complex128)
-        _kernels.turn_back(blocks, cycles * self.hop, stream)
-        tail = np.zeros(n_line, np.complex128)
-        if self.n_tail:
-            last = np.zeros((self.n_tap, 2), samples.dtype)
-            last[: self.n_tail] = samples[self.n_sample - self.n_tail :]
-            fold(last, 1, folded)
-            block = folded[0] @ self._matrix
-            tail = (block[:n_line] + 1j * block[n_line:]) * np.exp(-2j * np.pi * cycles * (self.hop * self.n_block))
+        stream, tail = np.empty((n_line, self.n_block), np.complex128), np.empty(n_line, np.complex128)
+        _kernels.turn_back(blocks, cycles * self.hop, stream, tail)
         return LineStreams(
             stream=stream,
             tail=tail,
@@ -221,46 +229,54 @@ class LineBank:
             n_tap=self.n_tap,
             n_tail=self.n_tail,
             n_sample=self.n_sample,
+            clock_ppm=clock_ppm,
             cycles=cycles,
             shift_cycles=shift,
-            template_cycles=self._template,
+            template_cycles=self.template_cycles,
             window=self.window,
-            inspection=Inspection(*counts.tolist()),
+            inspection=counts,
         )
 
-    def _is_flat(self, samples: Samples) -> bool:
+    def inspects(self, samples: Samples) -> bool:
         """Whether samples are folded and inspected in one pass."""
-        return self.window == BOXCAR and samples.dtype == np.int16
+        # of a window's halves the second has the first's weights with another sign, if each is whole rows
+        halves = self.window == HANN and self.n_fold % 2 == 0
+        return samples.dtype == np.int16 and (self.window == BOXCAR or halves)
 
-    def _turns(self, shift_cycles: float) -> tuple[ComplexArray, ComplexArray]:
-        """Phasors that turn back by ``shift_cycles`` a sample: of each row of a period, and inside a row."""
+    def _fold_at(self, shift_cycles: float) -> Fold:
+        """Return what folds blocks whose band is turned back by ``shift_cycles`` a sample."""
         row = np.exp(-2j * np.pi * shift_cycles * self.period * np.arange(self.n_fold))
-        return row, np.exp(-2j * np.pi * shift_cycles * np.arange(self.period))
+        ramp = np.exp(-2j * np.pi * shift_cycles * np.arange(self.period))
+        one_pass = self._one_pass(row, ramp)
+        weighted = self._weighted(row, ramp)
+        return lambda samples, *rest: (one_pass if self.inspects(samples) else weighted)(samples, *rest)
 
-    def _flat_fold(self, shift_cycles: float) -> Fold:
-        row, ramp = self._turns(shift_cycles)
+    def _one_pass(self, row: ComplexArray, ramp: ComplexArray) -> Fold:
         turns = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
         limit = np.int16(min(self.full_scale, 32767.0))
+        kernel = _kernels.fold_hann_i16 if self.window == HANN else _kernels.fold_flat_i16
 
-        def fold(samples: Samples, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
+        def fold(samples: Samples, n_seen: int, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
             pair = samples.view(np.int32).ravel()
             flat = samples.reshape(-1)
-            clipped, fill, zero = _kernels.fold_flat_i16(flat, pair, *turns, n_block, limit, _ZERO_SEGMENT, out)
+            clipped, fill, zero = kernel(flat, pair, *turns, n_block, limit, _ZERO_SEGMENT, n_seen, out)
             return Inspection(clipped, fill, zero, 0)
 
         return fold
 
-    def _weighted_fold(self, shift_cycles: float) -> Fold:
-        row, ramp = self._turns(shift_cycles)
-        weight = self._envelope * np.multiply.outer(row, ramp).ravel()
-        parts = weight.real.astype(np.float32), weight.imag.astype(np.float32)
+    def _weighted(self, row: ComplexArray, ramp: ComplexArray) -> Fold:
+        weight = (self._envelope * np.multiply.outer(row, ramp).ravel()).astype(np.complex64)
+        parts = np.ascontiguousarray(weight.real), np.ascontiguousarray(weight.imag)
 
-        def fold(samples: Samples, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
+        def fold(samples: Samples, n_seen: int, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
             is_int = samples.dtype == np.int16
+            short = (n_block - 1) * self.hop + self.n_tap - len(samples)
+            if short > 0:  # the frame's tail
+                samples = np.concatenate([samples, np.zeros((short, 2), samples.dtype)])
             flat = samples.view(np.int32 if is_int else np.complex64).ravel()
             kernel = _kernels.fold_i16 if is_int else _kernels.fold_c64
             kernel(flat, *parts, self.hop, self.n_fold, self.period, n_block, out)
-            return Inspection(0, 0, 0, 0)
+            return NOTHING_WRONG
 
         return fold
 

@@ -45,9 +45,7 @@ def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], p
     return float(candidate[int(np.argmax(score))])
 
 
-def refine_clock(
-    streams: LineStreams, plan: LinePlan, clock_ppm: float, range_ppm: float
-) -> tuple[float, float, float]:
+def refine_clock(streams: LineStreams, plan: LinePlan, range_ppm: float) -> tuple[float, float, float]:
     """Refine the clock offset to the maximum of the power that the carriers add up to over the frame.
 
     Maximum likelihood for carriers of unknown complex amplitude that do not overlap, in white noise. The sidebands
@@ -56,9 +54,9 @@ def refine_clock(
     Parameters
     ----------
     streams
-        Separated at ``clock_ppm``.
+        Separated at the clock offset to begin with.
     range_ppm
-        Search plus and minus this about ``clock_ppm``; never beyond what one block can tell apart.
+        Search plus and minus this about it; never beyond what one block can tell apart.
 
     Returns
     -------
@@ -81,7 +79,7 @@ def refine_clock(
     offset, curvature, coherent, incoherent = _kernels.most_coherent(
         streams.stream, every, n_group, slope_hop * n_group, n_side, step
     )
-    return clock_ppm + offset, curvature, coherent / incoherent if incoherent > 0.0 else 0.0
+    return streams.clock_ppm + offset, curvature, coherent / incoherent if incoherent > 0.0 else 0.0
 
 
 def _group_length(n_block: int, turns: float) -> int:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels
-from rfpose.dsp.bank import LineStreams
+from rfpose.dsp.bank import LineBank, LineStreams
 
-__all__ = ["LineFit", "fit_lines", "smooth_variance"]
+__all__ = ["JointFit", "LineFit", "smooth_variance"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -20,23 +21,10 @@ _MAX_GROUPS = 64
 """Groups of blocks from which the noise is read: with thirty lines its sigma is then good to 1 %."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Mixing:
-    """How lines leak into each other's block sums, each line's own response taken as one.
-
-    It hardly changes with the clock: a step of a thousandth of a ppm moves it by less than 1e-7. A second fit after
-    such a step uses it again.
-
-    Attributes
-    ----------
-    inverse : (line, line)
-        Takes the leakage off the sums over a whole frame.
-    group : (line, line)
-        Leakage in the sums over a group of blocks.
-    """
-
-    inverse: ComplexArray
-    group: ComplexArray
+_NODE_CYCLES = 0.02
+"""From one clock offset at which leakage is computed to the next: the band's edges turn by as much in a frame."""
+_MAX_NODE_PPM = 0.1
+_MAX_NODES = 2048
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,93 +39,119 @@ class LineFit:
         Variance of the complex amplitude, from the noise left in the blocks about each line after the clock's step.
     clock_step_ppm, clock_step_sigma_ppm
         How far the residuals ask the clock offset to move, one Gauss-Newton step, and its standard deviation [ppm].
-    mixing
-        For another fit of the same frame.
     """
 
     amplitude: ComplexArray
     variance: FloatArray
     clock_step_ppm: float
     clock_step_sigma_ppm: float
-    mixing: Mixing
 
 
-def fit_lines(streams: LineStreams, cycles_per_ppm: FloatArray, mixing: Mixing | None = None) -> LineFit:
-    """Fit the amplitudes of all lines to the block sums, by least squares over the whole frame.
+class JointFit:
+    """Fits the amplitudes of all lines to the block sums of one bank, by least squares over the whole frame.
 
     With x = A c + noise and block templates T close to A, solves (Tᴴ A) c = Tᴴ x: unbiased whatever the lines'
-    frequencies, and within the templates' small mismatch of maximum likelihood in white noise.
+    frequencies, and within the templates' small mismatch of maximum likelihood in white noise. How lines leak into
+    each other's sums is computed at clock offsets `step_ppm` apart, kept, and taken linearly between them: what that
+    leaves out is below 1e-7 of a line.
 
     Parameters
     ----------
-    streams
-        Of a bank without window.
-    cycles_per_ppm : (line,)
-        How far the clock moves each line [cycles/sample/ppm].
-    mixing
-        That of a fit of the same frame at a clock offset close by.
+    bank
+        Without window.
     """
-    n_line = len(streams.cycles)
-    n_group = max(1, streams.n_block // _MAX_GROUPS)
-    n_part = streams.n_block // n_group
-    if mixing is None:
-        mixing = _mixing(streams, n_group)
-    amplitude, own = np.empty((2, n_line), np.complex128)
-    model = np.empty((n_line, n_part), np.complex128)
-    _kernels.model_of_lines(
-        streams.stream.sum(axis=1) + streams.tail,
-        mixing.inverse,
-        streams.cycles,
-        streams.inside_cycles,
-        streams.hop,
-        streams.n_block,
-        streams.n_tail,
-        n_group,
-        streams.centre,
-        amplitude,
-        own,
-        model,
-    )
-    # Groups keep the work small in long frames; they are all alike, so that a few blocks at the end may be left out.
-    grouped = streams.stream[:, : n_part * n_group]
-    if n_group > 1:
-        grouped = grouped.reshape(n_line, n_part, n_group).sum(axis=2)
-    span = streams.hop * n_group
-    scatter = np.empty(n_line)
-    step, power = _kernels.residual_moments(
-        grouped,
-        mixing.group @ model,
-        streams.cycles * span,
-        2.0 * np.pi * cycles_per_ppm * model[:, 0],
-        0.5 * span - 0.5 - streams.centre,
-        span,
-        scatter,
-    )
-    n_free = max(1, n_part - 1)
-    noise = smooth_variance(scatter / (span * n_free), 2.0 * n_free)
-    return LineFit(
-        amplitude=amplitude,
-        variance=noise * np.abs(mixing.inverse.diagonal() / own),
-        clock_step_ppm=step,
-        clock_step_sigma_ppm=math.sqrt(0.5 * span * float(noise.mean()) / power) if power > 0.0 else np.inf,
-        mixing=mixing,
-    )
+
+    def __init__(self, bank: LineBank) -> None:
+        self.plan = bank.plan
+        self.n_group = max(1, bank.n_block // _MAX_GROUPS)
+        self.step_ppm = _node_step_ppm(bank)
+        self._slope = 2.0 * np.pi * bank.plan.cycles_per_ppm()
+        self._mixing = lru_cache(maxsize=_MAX_NODES)(lambda turned, node: _mixing(bank, turned, node, self.n_group))
+
+    def node_ppm(self, clock_ppm: float) -> float:
+        """Return the offset nearest to a clock's at which leakage is known: streams are to be separated there."""
+        return self.step_ppm * round(clock_ppm / self.step_ppm)
+
+    def __call__(self, streams: LineStreams, clock_ppm: float) -> LineFit:
+        """Fit one frame.
+
+        Parameters
+        ----------
+        streams
+            Separated at a `node_ppm`.
+        clock_ppm
+            Where the clock is now assumed [ppm].
+        """
+        cycles = self.plan.line_cycles(clock_ppm)
+        n_line, n_part = len(cycles), streams.n_block // self.n_group
+        hop, span = streams.hop, streams.hop * self.n_group
+        inverse, group = self._mixing_at(streams.clock_ppm, clock_ppm)
+        sums, amplitude, own = np.empty((3, n_line), np.complex128)
+        grouped, model = np.empty((2, n_line, n_part), np.complex128)
+        _kernels.group_lines(streams.stream, streams.tail, (streams.cycles - cycles) * hop, self.n_group, sums, grouped)
+        _kernels.model_of_lines(
+            sums,
+            inverse,
+            cycles,
+            cycles - streams.shift_cycles - streams.template_cycles,
+            hop,
+            streams.n_block,
+            streams.n_tail,
+            self.n_group,
+            streams.centre,
+            amplitude,
+            own,
+            model,
+        )
+        scatter = np.empty(n_line)
+        # Groups keep the work small in long frames; they are alike, so that a few blocks at the end may be left out.
+        step, power = _kernels.residual_moments(
+            grouped,
+            group @ model,
+            cycles * span,
+            np.ascontiguousarray(model[:, 0]),
+            self._slope,
+            0.5 * span - 0.5 - streams.centre,
+            span,
+            scatter,
+        )
+        n_free = max(1, n_part - 1)
+        noise = smooth_variance(scatter / (span * n_free), 2.0 * n_free)
+        return LineFit(
+            amplitude=amplitude,
+            variance=noise * np.abs(inverse.diagonal() / own),
+            clock_step_ppm=step,
+            clock_step_sigma_ppm=math.sqrt(0.5 * span * float(noise.mean()) / power) if power > 0.0 else np.inf,
+        )
+
+    def _mixing_at(self, turned_ppm: float, clock_ppm: float) -> ComplexArray:
+        """(2, line, line) as `_mixing` for a clock between two nodes."""
+        below = math.floor(clock_ppm / self.step_ppm)
+        part = clock_ppm / self.step_ppm - below
+        turned = round(turned_ppm / self.step_ppm)
+        return (1.0 - part) * self._mixing(turned, below) + part * self._mixing(turned, below + 1)
 
 
-def _mixing(streams: LineStreams, n_group: int) -> Mixing:
-    whole, group = np.empty((2, len(streams.cycles), len(streams.cycles)), np.complex128)
+def _node_step_ppm(bank: LineBank) -> float:
+    turns = bank.n_sample * 1e-6 * float(np.ptp(bank.plan.line_hz)) / bank.plan.sample_rate_hz
+    return min(_MAX_NODE_PPM, _NODE_CYCLES / turns) if turns > 0.0 else _MAX_NODE_PPM
+
+
+def _mixing(bank: LineBank, turned: int, node: int, n_group: int) -> ComplexArray:
+    """How lines leak into each other's sums, each line's own response taken as one.
+
+    (2, line, line): what takes the leakage off the sums over a whole frame, and the leakage in the sums over a group of
+    blocks. The band was turned back by the shift at one node, the clock is at the other.
+    """
+    step_ppm, plan = _node_step_ppm(bank), bank.plan
+    cycles = plan.line_cycles(node * step_ppm)
+    shift = plan.common_shift_cycles(turned * step_ppm)
+    mixing = np.empty((2, len(cycles), len(cycles)), np.complex128)
     _kernels.leakage(
-        streams.cycles,
-        streams.template_cycles,
-        streams.shift_cycles,
-        streams.hop,
-        streams.n_block,
-        streams.n_tail,
-        n_group,
-        whole,
-        group,
+        cycles, bank.template_cycles, shift, bank.hop, bank.n_block, bank.n_tail, n_group, mixing[0], mixing[1]
     )
-    return Mixing(inverse=np.asarray(np.linalg.inv(whole), np.complex128), group=group)
+    mixing[0] = np.linalg.inv(mixing[0])
+    return mixing
 
 
 def smooth_variance(variance: FloatArray, dof: float) -> FloatArray:

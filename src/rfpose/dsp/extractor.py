@@ -12,7 +12,7 @@ from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels, hilbert
 from rfpose.dsp.bank import ClockRange, Inspection, LineBank, LineStreams, inspect
 from rfpose.dsp.clock import coarse_clock_ppm, refine_clock
-from rfpose.dsp.correlator import fit_lines
+from rfpose.dsp.correlator import JointFit
 from rfpose.dsp.plan import LinePlan
 from rfpose.dsp.tones import FrameTones, LineStatus
 from rfpose.errors import InvalidInputError
@@ -65,6 +65,7 @@ class ToneExtractor:
         self.full_scale = float(full_scale)
         self._bank = lru_cache(maxsize=16)(self._make_bank)
         self._search_bank = lru_cache(maxsize=4)(self._make_search_bank)
+        self._fit = lru_cache(maxsize=16)(JointFit)
         self._drift_ppm = min(_CLOCK_DRIFT_PPM, plan.clock_search_ppm)
 
     def _bank_at(self, n_sample: int, clock_ppm: float) -> LineBank:
@@ -97,7 +98,7 @@ class ToneExtractor:
         coarse = coarse_clock_ppm(x, self.plan)
         bin_ppm = 1.0 / (min(len(x), 2**17) * float(np.max(np.abs(self.plan.cycles_per_ppm()))))
         streams = self._search_bank(len(x)).streams(x, coarse)
-        return refine_clock(streams, self.plan, coarse, min(bin_ppm, self.plan.clock_search_ppm))[0]
+        return refine_clock(streams, self.plan, min(bin_ppm, self.plan.clock_search_ppm))[0]
 
     def measure(self, samples: npt.ArrayLike, *, clock_ppm: float | None = None) -> FrameTones:
         """Measure one frame of one receiver.
@@ -124,26 +125,26 @@ class ToneExtractor:
         start_ppm = self.acquire_clock(x) if clock_ppm is None or not np.isfinite(clock_ppm) else float(clock_ppm)
         # a frame whose samples are bad has no clock; its samples are looked at all the same
         assumed_ppm = start_ppm if np.isfinite(start_ppm) else 0.0
-        streams = self._bank_at(len(x), assumed_ppm).streams(x, assumed_ppm)
+        bank = self._bank_at(len(x), assumed_ppm)
+        streams = bank.streams(x, self._fit(bank).node_ppm(assumed_ppm))
         fault, clipped = _fault(streams.inspection, len(x)), streams.inspection.clipped / len(x)
         if fault is not LineStatus.OK:
             return FrameTones.failed(self.plan.n_transmitter, self.plan.n_tone, fault, clipped_fraction=clipped)
-        ppm, curvature, coherence = refine_clock(streams, self.plan, start_ppm, self._drift_ppm)
+        ppm, curvature, coherence = refine_clock(streams, self.plan, self._drift_ppm)
         if clock_ppm is not None and coherence < 0.5:
             # the lines do not add up: either all is noise, or the clock has jumped
             again = self.acquire_clock(x)
             if abs(again - ppm) > self._drift_ppm:
-                streams = self._bank_at(len(x), again).streams(x, again)
-                ppm, curvature, _ = refine_clock(streams, self.plan, again, self._drift_ppm)
-        streams = streams.at_clock(self.plan, ppm)
+                bank = self._bank_at(len(x), again)
+                streams = bank.streams(x, self._fit(bank).node_ppm(again))
+                ppm, curvature, _ = refine_clock(streams, self.plan, self._drift_ppm)
         if self.estimator != "correlator":
-            return self._from_filters(streams, ppm, curvature, clipped)
-        slope = self.plan.cycles_per_ppm()
-        fit = fit_lines(streams, slope)
+            return self._from_filters(streams.at_clock(self.plan, ppm), ppm, curvature, clipped)
+        fit = self._fit(bank)(streams, ppm)
         # the power's maximum is shifted a little by leakage between lines; their joint fit is not
         ppm += fit.clock_step_ppm
         if abs(fit.clock_step_ppm) > _LINEAR_STEP_SIGMA * fit.clock_step_sigma_ppm:
-            fit = fit_lines(streams.at_clock(self.plan, ppm), slope, fit.mixing)
+            fit = self._fit(bank)(streams, ppm)
             ppm += fit.clock_step_ppm
         tone = hilbert.analytic_tones(fit.amplitude[:, None], self.plan.n_transmitter, self.plan.n_tone)[..., 0]
         return self._tones(
