@@ -69,7 +69,7 @@ def test_cosine_sum_response_is_the_windows_spectrum():
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_turn_back_and_turn_are_inverse_rotations():
+def test_turn_back_takes_each_lines_own_frequency_off():
     rng = np.random.default_rng(3)
     block = rng.standard_normal((9, 4)).astype(np.float32)
     cycles = np.array([0.3, -1.7])
@@ -84,8 +84,6 @@ def test_turn_back_and_turn_are_inverse_rotations():
         out = np.empty((2, 8), np.complex128)
         kernel(block, cycles, out, tail)
         np.testing.assert_allclose(np.column_stack([out, tail]), expected, atol=1e-12)
-    for _, found in both(_kernels.turn, expected, cycles, np.empty((2, 9), np.complex128)):
-        np.testing.assert_allclose(found, plain, atol=1e-12)
 
 
 @pytest.mark.parametrize("n_group", [1, 3])
@@ -163,16 +161,20 @@ def test_model_and_residual_of_known_lines():
     turned = samples * np.exp(-2j * np.pi * (template[:, None] * (n % hop) + cycles[:, None] * hop * (n // hop)))
     stream = turned[:, : hop * n_block].reshape(2, n_block // n_group, -1).sum(axis=2)
     model = np.empty((2, 4), np.complex128)
-    own, found = np.empty((2, 2), np.complex128)
+    gain, found, leak = np.empty(2), np.empty(2, np.complex128), np.empty((2, 2), np.complex128)
+    # two clock offsets between which leakage is taken linearly; what is asked for lies a quarter of the way
+    mixing, apart = np.stack([inverse, group]), np.array([[[0.1, -0.2j]], [[0.3j, 0.1]]])
+    between = mixing - 0.25 * apart, mixing + 0.75 * apart, 0.25
     for kernel, moments in (
         (_kernels.model_of_lines, _kernels.residual_moments),
         (_kernels.model_of_lines.py_func, _kernels.residual_moments.py_func),
     ):
-        arguments = hop, n_block, n_tail, n_group, centre, found, own, model
-        kernel(turned.sum(axis=1), inverse, cycles, cycles - template, *arguments)
+        arguments = hop, n_block, n_tail, n_group, centre, found, gain, leak, model
+        kernel(turned.sum(axis=1), *between, cycles, cycles - template, *arguments)
         np.testing.assert_allclose(found, amplitude, atol=1e-12)
         unit = [sums_of_unit_line(c, c, t, hop, n_sample) for c, t in zip(cycles, template, strict=True)]
-        np.testing.assert_allclose(own, unit, atol=1e-9)
+        np.testing.assert_allclose(gain, np.abs(inverse.diagonal() / unit), atol=1e-12)
+        np.testing.assert_allclose(leak, group, atol=1e-14)
         leaked, span, scatter = group @ model, hop * n_group, np.empty(2)
         turn = 2.0 * np.pi * np.array([1e-4, -2e-4])
         slope, first_model = turn * model[:, 0], model[:, 0].copy()
@@ -216,10 +218,11 @@ def test_filtered_lines_are_means_and_scatter():
     rng = np.random.default_rng(8)
     stream = rng.standard_normal((3, 7)) + 1j * rng.standard_normal((3, 7))
     to_centre = np.array([1.0, 1.0j, 0.5 - 0.5j])
-    line = stream * to_centre[:, None]
+    cycles = np.array([0.0, 0.1, -0.27])
+    line = stream * to_centre[:, None] * np.exp(2j * np.pi * np.outer(cycles, np.arange(7)))
     for kernel in (_kernels.filtered_lines, _kernels.filtered_lines.py_func):
-        own, amplitude, scatter = stream.copy(), np.empty(3, np.complex128), np.empty(3)
-        kernel(own, to_centre, amplitude, scatter)
+        own, amplitude, scatter = np.empty_like(stream), np.empty(3, np.complex128), np.empty(3)
+        kernel(stream, cycles, to_centre, own, amplitude, scatter)
         np.testing.assert_allclose(own, line)
         np.testing.assert_allclose(amplitude, line.mean(axis=1))
         np.testing.assert_allclose(scatter, np.mean(np.abs(line - line.mean(axis=1)[:, None]) ** 2, axis=1))
@@ -231,7 +234,9 @@ def test_tone_quality_marks_weak_tones_and_absent_carriers():
     tone = np.array([[6.0], [-2.0j], [6.0]], np.complex128)
     for kernel in (_kernels.tone_quality, _kernels.tone_quality.py_func):
         phase, sigma, status = np.ones((3, 1)), np.empty((3, 1)), np.zeros(3, np.uint8)
-        kernel(amplitude, variance, tone, np.full((3, 1), 0.01), 25.0, 8.0, 1, 2, phase, sigma, status)
+        parts = phase, sigma, np.empty((3, 3)), status
+        assert kernel(amplitude, variance, tone, np.full((3, 1), 0.01), 25.0, 8.0, 1, 2, *parts) == 0.5
+        np.testing.assert_allclose(parts[2], 0.5)
         np.testing.assert_array_equal(status, [0, 2, 1])
         np.testing.assert_array_equal(phase[:, 0], [1.0, np.nan, np.nan])
         np.testing.assert_allclose(sigma[:, 0], [np.sqrt(0.5 / 36.0 + 0.01), np.nan, np.nan])

@@ -477,17 +477,6 @@ def turn_back(block, cycles_hop, out, tail):
 
 
 @kernel
-def turn(stream, cycles_hop, out):
-    """Turn (line, block) on by ``cycles_hop`` a block."""
-    n_line, n_block = out.shape
-    phasor = np.empty(n_block, np.complex128)
-    for m in range(n_line):
-        _phasors(cycles_hop[m], n_block, phasor)
-        for k in range(n_block):
-            out[m, k] = stream[m, k] * phasor[k]
-
-
-@kernel
 def group_lines(stream, tail, cycles_hop, n_group, sums, grouped):
     """Turn (line, block) on by ``cycles_hop`` a block and add it up: over the frame with its tail, and over groups."""
     n_line, n_block = stream.shape
@@ -508,22 +497,41 @@ def group_lines(stream, tail, cycles_hop, n_group, sums, grouped):
 
 
 @kernel
-def model_of_lines(sums, inverse, cycles, inside_cycles, hop, n_block, n_tail, n_group, centre, amplitude, own, model):
+def model_of_lines(
+    sums,
+    below,
+    above,
+    part,
+    cycles,
+    inside_cycles,
+    hop,
+    n_block,
+    n_tail,
+    n_group,
+    centre,
+    amplitude,
+    gain,
+    group,
+    model,
+):
     """Amplitudes of all lines from their sums over a frame, and what each adds to each group of blocks.
 
-    ``inverse`` takes the leakage off ``sums``; ``inside_cycles`` is how fast a line turns against its template.
-    ``amplitude`` (line,) has its phase at ``centre``, ``own`` (line,) is the frame's response to a line of amplitude
-    one, ``model`` (line, group) in absolute time.
+    ``below`` and ``above`` (2, line, line), between which the clock has gone ``part`` of the way: what takes the
+    leakage off ``sums``, and the leakage in groups, which goes to ``group`` (line, line). ``inside_cycles`` is how fast
+    a line turns against its template. ``amplitude`` (line,) has its phase at ``centre``; ``gain`` (line,) is its
+    variance over that of a sum of so many samples; ``model`` (line, group) is in absolute time.
     """
     n_line, n_part = model.shape
     phasor = np.empty(n_part, np.complex128)
     for a in range(n_line):
         total = 0.0j
         for b in range(n_line):
-            total += inverse[a, b] * sums[b]
+            total += (below[0, a, b] + part * (above[0, a, b] - below[0, a, b])) * sums[b]
+            group[a, b] = below[1, a, b] + part * (above[1, a, b] - below[1, a, b])
         block = dirichlet(inside_cycles[a], hop)
-        own[a] = block * n_block + dirichlet(inside_cycles[a], n_tail)
-        at_start = total / own[a]
+        own = block * n_block + dirichlet(inside_cycles[a], n_tail)
+        gain[a] = abs((below[0, a, a] + part * (above[0, a, a] - below[0, a, a])) / own)
+        at_start = total / own
         amplitude[a] = at_start * _phasor(cycles[a] * centre)
         first = at_start * block * n_group
         _phasors(cycles[a] * hop * n_group, n_part, phasor)
@@ -589,41 +597,59 @@ def smooth_variance(variance, dof, out):
 
 
 @kernel
-def filtered_lines(stream, to_centre, amplitude, scatter):
-    """Refer (line, block) to the frame's centre in place; each line's mean and mean square distance from it."""
-    n_line, n_block = stream.shape
+def noise_of_lines(stream, model, cycles_span, first, slope, first_middle, span, gain, variance):
+    """Variance of each line's amplitude from what `residual_moments` finds; returns the clock's step and its sigma."""
+    n_line, n_part = stream.shape
+    scatter = np.empty(n_line)
+    step, power = residual_moments(stream, model, cycles_span, first, slope, first_middle, span, scatter)
+    n_free = max(1, n_part - 1)
+    smooth_variance(scatter / (span * n_free), 2.0 * n_free, variance)
+    sigma = math.sqrt(0.5 * span * variance.mean() / power) if power > 0.0 else math.inf
     for m in range(n_line):
+        variance[m] *= gain[m]
+    return step, sigma
+
+
+@kernel
+def filtered_lines(stream, cycles_hop, to_centre, line, amplitude, scatter):
+    """Turn (line, block) on by ``cycles_hop`` a block and refer it to the frame's centre: ``line``.
+
+    ``amplitude`` and ``scatter`` (line,) are each line's mean and mean square distance from it.
+    """
+    n_line, n_block = stream.shape
+    phasor = np.empty(n_block, np.complex128)
+    for m in range(n_line):
+        _phasors(cycles_hop[m], n_block, phasor)
         total = 0.0j
         for k in range(n_block):
-            stream[m, k] *= to_centre[m]
-            total += stream[m, k]
+            line[m, k] = stream[m, k] * (phasor[k] * to_centre[m])
+            total += line[m, k]
         mean = total / n_block
         square = 0.0
         for k in range(n_block):
-            left = stream[m, k] - mean
+            left = line[m, k] - mean
             square += left.real * left.real + left.imag * left.imag
         amplitude[m] = mean
         scatter[m] = square / n_block
 
 
-@kernel
-def _analytic(carrier, upper, lower):
-    """Return U C*/|C| + (L C*/|C|)*, the analytic tone."""
-    back = carrier.conjugate() / math.hypot(carrier.real, carrier.imag)
-    return upper * back + (lower * back).conjugate()
+@kernel_inline
+def _unit(z):
+    """Return z over its length, NaN where it has none."""
+    return z * (1.0 / math.sqrt(z.real * z.real + z.imag * z.imag))
 
 
 @kernel
 def analytic_tones(line, n_tone, out):
-    """(transmitter, tone, block) analytic tones of (transmitter × line, block) amplitudes."""
+    """(transmitter, tone, block) analytic tones U C*/|C| + (L C*/|C|)* of (transmitter × line, block) amplitudes."""
     n_transmitter, _, n_block = out.shape
     n_own = 1 + 2 * n_tone
     for i in range(n_transmitter):
-        for q in range(n_tone):
-            for k in range(n_block):
-                out[i, q, k] = _analytic(
-                    line[i * n_own, k], line[i * n_own + 1 + 2 * q, k], line[i * n_own + 2 + 2 * q, k]
-                )
+        for k in range(n_block):
+            back = _unit(line[i * n_own, k]).conjugate()
+            for q in range(n_tone):
+                lower = line[i * n_own + 2 + 2 * q, k] * back
+                out[i, q, k] = line[i * n_own + 1 + 2 * q, k] * back + lower.conjugate()
 
 
 @kernel
@@ -634,20 +660,24 @@ def mean_unit_phasor(tone, out):
         for q in range(n_tone):
             total = 0.0j
             for k in range(n_block):
-                z = tone[i, q, k]
-                total += z / math.hypot(z.real, z.imag)
+                total += _unit(tone[i, q, k])
             out[i, q] = total / n_block
 
 
 @kernel
-def tone_quality(amplitude, variance, tone, added, least_carrier, least_tone, absent, weak, phase, sigma, status):
+def tone_quality(
+    amplitude, variance, tone, added, least_carrier, least_tone, absent, weak, phase, sigma, line_sigma, status
+):
     """Sigma of each tone's phase; NaN, with a status, where the tone or its carrier is too weak to have one.
 
     ``amplitude`` and ``variance`` (transmitter, line): carrier, then upper and lower sideband of each tone; ``tone``,
-    ``added`` variance, ``phase``, ``sigma`` (transmitter, tone). ``status`` holds 0 already.
+    ``added`` variance, ``phase``, ``sigma`` (transmitter, tone). ``line_sigma`` (transmitter, line) is that of an
+    amplitude's part; ``status`` holds 0 already. Returns the lines' median variance.
     """
     n_transmitter, n_tone = tone.shape
     for i in range(n_transmitter):
+        for m in range(variance.shape[1]):
+            line_sigma[i, m] = math.sqrt(0.5 * variance[i, m])
         for q in range(n_tone):
             noise = variance[i, 1 + 2 * q] + variance[i, 2 + 2 * q]
             power = tone[i, q].real ** 2 + tone[i, q].imag ** 2
@@ -659,6 +689,7 @@ def tone_quality(amplitude, variance, tone, added, least_carrier, least_tone, ab
         if status[i] != 0:
             phase[i] = math.nan
             sigma[i] = math.nan
+    return np.median(variance)
 
 
 @kernel

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from operator import add
 from typing import NamedTuple
@@ -128,24 +128,17 @@ class LineStreams:
         """The frame's centre, to which phases refer [samples from its start]."""
         return 0.5 * (self.n_sample - 1)
 
-    def at_clock(self, plan: LinePlan, clock_ppm: float) -> LineStreams:
-        """Return the streams turned back for another clock offset (templates stay as they were)."""
-        cycles = plan.line_cycles(clock_ppm)
-        back = (self.cycles - cycles) * self.hop
-        stream = np.empty_like(self.stream)
-        _kernels.turn(self.stream, back, stream)
-        tail = self.tail * np.exp(2j * np.pi * back * self.n_block)
-        return replace(self, stream=stream, tail=tail, cycles=cycles)
+    def response(self, cycles: FloatArray | None = None) -> ComplexArray:
+        """(line,) response of one block at its start to each line's unit amplitude with phase counted from there.
 
-    @property
-    def inside_cycles(self) -> FloatArray:
-        """(line,) how fast each line turns against its template inside a block [cycles/sample]."""
-        return self.cycles - self.shift_cycles - self.template_cycles
-
-    def response(self) -> ComplexArray:
-        """(line,) response of one block at its start to each line's unit amplitude with phase counted from there."""
+        Parameters
+        ----------
+        cycles : (line,)
+            Frequency of each line, if the clock is no longer assumed where it was [cycles/sample].
+        """
         out = np.empty(len(self.cycles), np.complex128)
-        _kernels.cosine_sum_response(self.inside_cycles, self.n_tap, np.array(self.window), out)
+        inside = (self.cycles if cycles is None else cycles) - self.shift_cycles - self.template_cycles
+        _kernels.cosine_sum_response(inside, self.n_tap, np.array(self.window), out)
         return out
 
 

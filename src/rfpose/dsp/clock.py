@@ -69,7 +69,7 @@ def refine_clock(streams: LineStreams, plan: LinePlan, range_ppm: float) -> tupl
     """
     every = 1 + 2 * plan.n_tone
     slope_hop = plan.cycles_per_ppm()[::every] * streams.hop
-    steepest = float(np.max(np.abs(slope_hop)))
+    steepest = float(np.abs(slope_hop).max())
     n_group = _group_length(streams.n_block, steepest * range_ppm)
     n_part = streams.n_block // n_group
     steepest *= n_group

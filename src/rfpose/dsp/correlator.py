@@ -85,13 +85,18 @@ class JointFit:
         cycles = self.plan.line_cycles(clock_ppm)
         n_line, n_part = len(cycles), streams.n_block // self.n_group
         hop, span = streams.hop, streams.hop * self.n_group
-        inverse, group = self._mixing_at(streams.clock_ppm, clock_ppm)
-        sums, amplitude, own = np.empty((3, n_line), np.complex128)
+        below = math.floor(clock_ppm / self.step_ppm)
+        turned = round(streams.clock_ppm / self.step_ppm)
+        sums, amplitude = np.empty((2, n_line), np.complex128)
+        gain, variance = np.empty((2, n_line))
         grouped, model = np.empty((2, n_line, n_part), np.complex128)
+        group = np.empty((n_line, n_line), np.complex128)
         _kernels.group_lines(streams.stream, streams.tail, (streams.cycles - cycles) * hop, self.n_group, sums, grouped)
         _kernels.model_of_lines(
             sums,
-            inverse,
+            self._mixing(turned, below),
+            self._mixing(turned, below + 1),
+            clock_ppm / self.step_ppm - below,
             cycles,
             cycles - streams.shift_cycles - streams.template_cycles,
             hop,
@@ -100,12 +105,12 @@ class JointFit:
             self.n_group,
             streams.centre,
             amplitude,
-            own,
+            gain,
+            group,
             model,
         )
-        scatter = np.empty(n_line)
         # Groups keep the work small in long frames; they are alike, so that a few blocks at the end may be left out.
-        step, power = _kernels.residual_moments(
+        step, sigma = _kernels.noise_of_lines(
             grouped,
             group @ model,
             cycles * span,
@@ -113,23 +118,10 @@ class JointFit:
             self._slope,
             0.5 * span - 0.5 - streams.centre,
             span,
-            scatter,
+            gain,
+            variance,
         )
-        n_free = max(1, n_part - 1)
-        noise = smooth_variance(scatter / (span * n_free), 2.0 * n_free)
-        return LineFit(
-            amplitude=amplitude,
-            variance=noise * np.abs(inverse.diagonal() / own),
-            clock_step_ppm=step,
-            clock_step_sigma_ppm=math.sqrt(0.5 * span * float(noise.mean()) / power) if power > 0.0 else np.inf,
-        )
-
-    def _mixing_at(self, turned_ppm: float, clock_ppm: float) -> ComplexArray:
-        """(2, line, line) as `_mixing` for a clock between two nodes."""
-        below = math.floor(clock_ppm / self.step_ppm)
-        part = clock_ppm / self.step_ppm - below
-        turned = round(turned_ppm / self.step_ppm)
-        return (1.0 - part) * self._mixing(turned, below) + part * self._mixing(turned, below + 1)
+        return LineFit(amplitude=amplitude, variance=variance, clock_step_ppm=step, clock_step_sigma_ppm=sigma)
 
 
 def _node_step_ppm(bank: LineBank) -> float:

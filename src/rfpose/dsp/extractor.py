@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -33,6 +34,7 @@ _LINEAR_STEP_SIGMA = 3.0
 """A step of the clock within so many sigma bends the lines less than the noise does: it needs no second fit."""
 _CARRIER_POWER_SNR = 25.0
 """A carrier counts as present above this power ratio to the noise: false alarm exp(−25) a line."""
+_OK, _ABSENT, _WEAK = int(LineStatus.OK), int(LineStatus.ABSENT), int(LineStatus.WEAK)
 _TONE_POWER_SNR = 8.0
 """A tone has a usable phase above this power ratio; its sigma is then below 0.25 rad."""
 
@@ -139,7 +141,7 @@ class ToneExtractor:
                 streams = bank.streams(x, self._fit(bank).node_ppm(again))
                 ppm, curvature, _ = refine_clock(streams, self.plan, self._drift_ppm)
         if self.estimator != "correlator":
-            return self._from_filters(streams.at_clock(self.plan, ppm), ppm, curvature, clipped)
+            return self._from_filters(streams, ppm, curvature, clipped)
         fit = self._fit(bank)(streams, ppm)
         # the power's maximum is shifted a little by leakage between lines; their joint fit is not
         ppm += fit.clock_step_ppm
@@ -147,82 +149,78 @@ class ToneExtractor:
             fit = self._fit(bank)(streams, ppm)
             ppm += fit.clock_step_ppm
         tone = hilbert.analytic_tones(fit.amplitude[:, None], self.plan.n_transmitter, self.plan.n_tone)[..., 0]
-        return self._tones(
-            fit.amplitude,
-            fit.variance,
-            tone,
-            np.angle(tone),
-            0.0,
-            float(len(x)),
-            (ppm, fit.clock_step_sigma_ppm),
-            clipped,
+        lines = _Lines(
+            amplitude=fit.amplitude,
+            variance=fit.variance,
+            tone=tone,
+            phase=np.angle(tone),
+            added_variance=np.zeros(tone.shape),
+            n_effective=float(len(x)),
         )
+        return self._tones(lines, (ppm, fit.clock_step_sigma_ppm), clipped)
 
     def _from_filters(self, streams: LineStreams, ppm: float, curvature: float, clipped: float) -> FrameTones:
         """Measure by averaging the filtered, analytic tones."""
         n_transmitter, n_tone = self.plan.n_transmitter, self.plan.n_tone
-        line, amplitude, variance = hilbert.average_lines(streams)
-        tone = hilbert.analytic_tones(amplitude[:, None], n_transmitter, n_tone)[..., 0]
+        filtered = hilbert.average_lines(streams, self.plan.line_cycles(ppm))
+        tone = hilbert.analytic_tones(filtered.amplitude[:, None], n_transmitter, n_tone)[..., 0]
         phase, added = self._averaged_phase(
-            streams, hilbert.analytic_tones(line, n_transmitter, n_tone), tone, variance
+            filtered, hilbert.analytic_tones(filtered.line, n_transmitter, n_tone), tone
         )
-        n_effective = hilbert.window_statistics(streams).equivalent_samples
-        clock = ppm, _clock_sigma(streams, curvature, float(np.median(variance)) * n_effective)
-        return self._tones(amplitude, variance, tone, phase, added, n_effective, clock, clipped)
+        lines = _Lines(
+            amplitude=filtered.amplitude,
+            variance=filtered.variance,
+            tone=tone,
+            phase=phase,
+            added_variance=added,
+            n_effective=filtered.statistics.equivalent_samples,
+        )
+        return self._tones(lines, (ppm, _clock_sigma(filtered, curvature)), clipped)
 
-    def _tones(
-        self,
-        amplitude: ComplexArray,
-        variance: FloatArray,
-        tone: ComplexArray,
-        phase: FloatArray,
-        added_variance: FloatArray | float,
-        n_effective: float,
-        clock: tuple[float, float],
-        clipped: float,
-    ) -> FrameTones:
+    def _tones(self, lines: _Lines, clock: tuple[float, float], clipped: float) -> FrameTones:
         """Put the record together, and mark what is too weak."""
-        n_transmitter = self.plan.n_transmitter
-        by_transmitter, lines = amplitude.reshape(n_transmitter, -1), variance.reshape(n_transmitter, -1)
-        sigma, status = np.empty(tone.shape), np.full(n_transmitter, LineStatus.OK, np.uint8)
-        _kernels.tone_quality(
+        n_transmitter, shape = self.plan.n_transmitter, lines.tone.shape
+        by_transmitter = lines.amplitude.reshape(n_transmitter, -1)
+        sigma, line_sigma = np.empty(shape), np.empty(by_transmitter.shape)
+        status = np.full(n_transmitter, _OK, np.uint8)
+        typical = _kernels.tone_quality(
             by_transmitter,
-            lines,
-            tone,
-            np.broadcast_to(added_variance, tone.shape),
+            lines.variance.reshape(n_transmitter, -1),
+            lines.tone,
+            lines.added_variance,
             _CARRIER_POWER_SNR,
             _TONE_POWER_SNR,
-            int(LineStatus.ABSENT),
-            int(LineStatus.WEAK),
-            phase,
+            _ABSENT,
+            _WEAK,
+            lines.phase,
             sigma,
+            line_sigma,
             status,
         )
-        line_sigma = np.sqrt(0.5 * lines)
         return FrameTones(
-            phase_rad=phase,
+            phase_rad=lines.phase,
             sigma_rad=sigma,
             carrier=by_transmitter[:, 0],
             carrier_sigma=line_sigma[:, 0],
-            sideband=by_transmitter[:, 1:].reshape(*tone.shape, 2),
-            sideband_sigma=line_sigma[:, 1:].reshape(*tone.shape, 2),
+            sideband=by_transmitter[:, 1:].reshape(*shape, 2),
+            sideband_sigma=line_sigma[:, 1:].reshape(*shape, 2),
             clock_ppm=clock[0],
             clock_sigma_ppm=clock[1],
-            noise_variance=float(np.median(variance)) * n_effective,
+            noise_variance=typical * lines.n_effective,
             clipped_fraction=clipped,
             status=status,
         )
 
     def _averaged_phase(
-        self, streams: LineStreams, tones: ComplexArray, mean_tone: ComplexArray, variance: FloatArray
+        self, filtered: hilbert.FilteredLines, tones: ComplexArray, mean_tone: ComplexArray
     ) -> tuple[FloatArray, FloatArray]:
         """Phase by the chosen average of the analytic tones, and the variance it adds to the noise's own."""
         signed = hilbert.unit_phasor_phase(tones)
-        lines = variance.reshape(self.plan.n_transmitter, -1)
-        statistics = hilbert.window_statistics(streams)
-        per_output = (lines[:, 1::2] + lines[:, 2::2]) * (statistics.equivalent_samples * statistics.gain)
+        variance, statistics = filtered.variance.reshape(self.plan.n_transmitter, -1), filtered.statistics
+        per_output = (variance[:, 1::2] + variance[:, 2::2]) * (statistics.equivalent_samples * statistics.gain)
         if self.estimator == "hilbert":
-            return signed, hilbert.unit_phasor_variance(per_output / np.abs(mean_tone) ** 2, streams)
+            power = mean_tone.real**2 + mean_tone.imag**2
+            return signed, hilbert.unit_phasor_variance(per_output / power, statistics, tones.shape[2])
         reference = int(np.argmax(np.abs(mean_tone[:, 0])))
         ref_tone = tones[reference][None]
         if self.estimator == "dot":
@@ -232,6 +230,18 @@ class ToneExtractor:
         difference = np.mod(signed - signed[reference] + np.pi, 2.0 * np.pi) - np.pi
         phase = np.where(np.arange(len(unsigned))[:, None] == reference, 0.0, np.copysign(unsigned, difference))
         return phase, np.zeros_like(phase)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Lines:
+    """What an estimator found in a frame: lines, their analytic tones, and samples that average noise as well."""
+
+    amplitude: ComplexArray
+    variance: FloatArray
+    tone: ComplexArray
+    phase: FloatArray
+    added_variance: FloatArray
+    n_effective: float
 
 
 def _fault(inspection: Inspection, n_sample: int) -> LineStatus:
@@ -247,15 +257,13 @@ def _fault(inspection: Inspection, n_sample: int) -> LineStatus:
     return LineStatus.OK
 
 
-def _clock_sigma(streams: LineStreams, curvature: float, noise_variance: float) -> float:
+def _clock_sigma(filtered: hilbert.FilteredLines, curvature: float) -> float:
     """Return the standard deviation of the clock offset [ppm] from the curvature of the coherent power."""
     if not curvature > 0.0:
         return np.nan
-    response = streams.response()
-    gain = float(np.mean(np.abs(response)))
-    covered = gain * streams.n_block
-    n = hilbert.window_statistics(streams).equivalent_samples
-    return float(np.sqrt(noise_variance * covered**2 / (2.0 * curvature * n)))
+    gain = float(np.abs(filtered.response).mean())
+    covered = gain * filtered.line.shape[1]
+    return math.sqrt(float(np.median(filtered.variance)) * covered**2 / (2.0 * curvature))
 
 
 def _as_samples(samples: npt.ArrayLike) -> Samples:

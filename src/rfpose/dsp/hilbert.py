@@ -35,12 +35,12 @@ ComplexArray = npt.NDArray[np.complex128]
 
 def centred_streams(streams: LineStreams) -> ComplexArray:
     """(line, block) amplitude of each line over time, its phase referred to the frame's centre."""
-    return np.asarray(streams.stream * _to_centre(streams)[:, None])
+    return np.asarray(streams.stream * _to_centre(streams, streams.cycles, streams.response())[:, None])
 
 
-def _to_centre(streams: LineStreams) -> ComplexArray:
+def _to_centre(streams: LineStreams, cycles: FloatArray, response: ComplexArray) -> ComplexArray:
     """(line,) factor that makes a filter's output the line's amplitude with its phase at the frame's centre."""
-    return np.asarray(np.exp(2j * np.pi * streams.cycles * streams.centre) / streams.response())
+    return np.asarray(np.exp(2j * np.pi * streams.centre * cycles) / response)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,31 +95,57 @@ def analytic_tones(line: ComplexArray, n_transmitter: int, n_tone: int) -> Compl
     return out
 
 
-def average_lines(streams: LineStreams) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """Each line over time, its mean amplitude, and the variance of that mean from the scatter about it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilteredLines:
+    """Each line as its filter gives it.
+
+    Attributes
+    ----------
+    line : (line, block)
+        As `centred_streams`.
+    amplitude, variance : (line,)
+        Mean over the frame, and that mean's variance from the scatter about it.
+    response : (line,)
+        Of one block to unit amplitude.
+    statistics
+        How the windows average noise.
+    """
+
+    line: ComplexArray
+    amplitude: ComplexArray
+    variance: FloatArray
+    response: ComplexArray
+    statistics: WindowStatistics
+
+
+def average_lines(streams: LineStreams, cycles: FloatArray) -> FilteredLines:
+    """Bring the lines to another clock offset and average them.
 
     Parameters
     ----------
     streams
         Of a windowed bank.
-
-    Returns
-    -------
-    line : (line, block)
-        As `centred_streams`.
-    amplitude, variance : (line,)
+    cycles : (line,)
+        Frequency of each line where the clock is now assumed [cycles/sample].
     """
-    statistics = window_statistics(streams)
-    line = np.array(streams.stream)
+    statistics, response = window_statistics(streams), streams.response(cycles)
+    line = np.empty_like(streams.stream)
     amplitude, scatter = np.empty(len(line), np.complex128), np.empty(len(line))
-    _kernels.filtered_lines(line, _to_centre(streams), amplitude, scatter)
+    back = (streams.cycles - cycles) * streams.hop
+    _kernels.filtered_lines(streams.stream, back, _to_centre(streams, cycles, response), line, amplitude, scatter)
     n_equivalent = statistics.equivalent_samples
     dof = max(2.0 * n_equivalent * statistics.gain, 2.0)
     per_sample = scatter / (statistics.gain - 1.0 / n_equivalent)
-    return line, amplitude, smooth_variance(per_sample, dof) / n_equivalent
+    return FilteredLines(
+        line=line,
+        amplitude=amplitude,
+        variance=smooth_variance(per_sample, dof) / n_equivalent,
+        response=response,
+        statistics=statistics,
+    )
 
 
-def unit_phasor_variance(relative_noise: FloatArray, streams: LineStreams) -> FloatArray:
+def unit_phasor_variance(relative_noise: FloatArray, statistics: WindowStatistics, n_block: int) -> FloatArray:
     """Variance that discarding the phasors' lengths adds to the mean phase [rad²].
 
     With noise of variance s² in each part of a unit phasor, ``mean(h/|h|)`` has phase variance s² + s⁴ an output;
@@ -129,9 +155,11 @@ def unit_phasor_variance(relative_noise: FloatArray, streams: LineStreams) -> Fl
     ----------
     relative_noise : (...)
         Variance of the complex noise over the power of the tone, in one output.
+    statistics, n_block
+        Of the outputs.
     """
     s2 = 0.5 * relative_noise
-    return np.asarray(s2 * s2 * window_statistics(streams).second_order / streams.n_block)
+    return np.asarray(s2 * s2 * (statistics.second_order / n_block))
 
 
 def unit_phasor_phase(tone: ComplexArray) -> FloatArray:

@@ -32,6 +32,8 @@ class LinePlan:
         Ranging tones [Hz].
     line_hz : (transmitter × line,)
         Every line [Hz]: of each transmitter the carrier, then upper and lower sideband of each tone.
+    line_rf_cycles : (line,)
+        Every line's RF over the sample rate [cycles/sample].
     sample_rate_hz, centre_frequency_hz
         Of the recording [Hz].
     clock_search_ppm
@@ -44,6 +46,7 @@ class LinePlan:
     carrier_hz: FloatArray
     tone_hz: FloatArray
     line_hz: FloatArray
+    line_rf_cycles: FloatArray
     sample_rate_hz: float
     centre_frequency_hz: float
     clock_search_ppm: float
@@ -74,10 +77,12 @@ class LinePlan:
         if np.max(np.abs(carrier)) + np.max(tone) >= rate / 2.0:
             raise InvalidInputError("`carrier_hz` ± `tone_hz` must lie inside ±`sample_rate_hz`/2")
         offset = np.array([0.0, *(sign * f for f in tone for sign in (1.0, -1.0))])
+        line = (carrier[:, None] + offset).ravel()
         return cls(
             carrier_hz=read_only(carrier),
             tone_hz=read_only(tone),
-            line_hz=read_only((carrier[:, None] + offset).ravel()),
+            line_hz=read_only(line),
+            line_rf_cycles=read_only((float(centre_frequency_hz) + line) / rate),
             sample_rate_hz=rate,
             centre_frequency_hz=float(centre_frequency_hz),
             clock_search_ppm=float(clock_search_ppm),
@@ -118,8 +123,7 @@ class LinePlan:
         ``(f − k f_c) / (k f_s)``.
         """
         k = 1.0 + clock_ppm * 1e-6
-        rf_hz = self.centre_frequency_hz + self.line_hz
-        return (rf_hz / k - self.centre_frequency_hz) / self.sample_rate_hz
+        return self.line_rf_cycles / k - self.centre_frequency_hz / self.sample_rate_hz
 
     def common_shift_cycles(self, clock_ppm: float) -> float:
         """Shift of the band's centre by the clock offset [cycles/sample]; what is left of a line's is small."""
@@ -128,7 +132,7 @@ class LinePlan:
 
     def cycles_per_ppm(self) -> FloatArray:
         """(line,) how far one part per million moves each line [cycles/sample], to first order."""
-        return -1e-6 * (self.centre_frequency_hz + self.line_hz) / self.sample_rate_hz
+        return -1e-6 * self.line_rf_cycles
 
 
 def _common_grid(frequency_hz: FloatArray, rate_hz: float) -> int | None:
