@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +17,9 @@ from rfpose.files import write_atomically
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Tabled", "data_frame", "labelled_library", "write_csv"]
+__all__ = ["TABLE_ENDINGS", "Tabled", "data_frame", "labelled_library", "write_csv", "write_parquet", "write_table"]
+
+TABLE_ENDINGS = (".csv", ".parquet")
 
 
 class Tabled(ABC):
@@ -28,7 +32,7 @@ class Tabled(ABC):
         """Return header and rows."""
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
-        """Write the table as CSV, numbers to six digits.
+        """Write the table: CSV, numbers to six digits; or Parquet, numbers as they are, if ``path`` ends so.
 
         Parameters
         ----------
@@ -42,7 +46,7 @@ class Tabled(ABC):
         RecordingError
             The file exists, or cannot be written.
         """
-        write_csv(path, *self.table(), force=force)
+        write_table(path, *self.table(), force=force)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the table; needs pandas."""
@@ -50,7 +54,7 @@ class Tabled(ABC):
 
 
 def write_csv(path: str | Path, header: Sequence[str], rows: Sequence[Sequence[Any]], *, force: bool = True) -> None:
-    """Write rows as CSV: floats to six digits, everything else as it is.
+    """Write rows as CSV: floats to six digits, NaN as nothing, times in ISO 8601.
 
     Raises
     ------
@@ -60,8 +64,41 @@ def write_csv(path: str | Path, header: Sequence[str], rows: Sequence[Sequence[A
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows([f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows)
+    writer.writerows([_cell(cell) for cell in row] for row in rows)
     write_atomically(path, text.getvalue().encode(), force=force)
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, datetime):
+        return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return value
+
+
+def write_table(path: str | Path, header: Sequence[str], rows: Sequence[Sequence[Any]], *, force: bool = True) -> None:
+    """Write rows as Parquet where the name ends in ``.parquet``, else as CSV; raises as these do."""
+    write = write_parquet if Path(path).suffix == ".parquet" else write_csv
+    write(path, header, rows, force=force)
+
+
+def write_parquet(
+    path: str | Path, header: Sequence[str], rows: Sequence[Sequence[Any]], *, force: bool = True
+) -> None:
+    """Write rows as Parquet: numbers with all their digits, times as times, what is not known as null.
+
+    Raises
+    ------
+    InvalidInputError
+        pyarrow is not installed.
+    RecordingError
+        The file exists and ``force`` is not set, or it cannot be written.
+    """
+    arrow, parquet = labelled_library("pyarrow"), labelled_library("pyarrow.parquet")
+    columns = {name: arrow.array([row[k] for row in rows], from_pandas=True) for k, name in enumerate(header)}
+    image = io.BytesIO()
+    parquet.write_table(arrow.table(columns), image)
+    write_atomically(path, image.getvalue(), force=force)
 
 
 def data_frame(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> pd.DataFrame:
@@ -77,7 +114,7 @@ def data_frame(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> pd.DataF
 
 
 def labelled_library(name: str) -> Any:
-    """Return pandas or xarray, which only labelled tables need.
+    """Return pandas, xarray or pyarrow, which only labelled tables need.
 
     Raises
     ------
@@ -89,4 +126,6 @@ def labelled_library(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise InvalidInputError(f"this needs {name}; install it, {install_remedy('labelled')}") from error
+        raise InvalidInputError(
+            f"this needs {name.partition('.')[0]}; install it, {install_remedy('labelled')}"
+        ) from error

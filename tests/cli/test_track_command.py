@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from rfpose.cli import _app
 from rfpose.cli.track import _METHODS
 from rfpose.errors import RecordingError
+from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS
 from rfpose.pipeline.formats.track_file import is_track, open_track
 from rfpose.pipeline.track import TrackChanges, track
@@ -33,9 +34,11 @@ def run(*arguments):
 
 
 def test_table_json_csv_and_picture(site, tmp_path):
-    out, table, picture = tmp_path / "run.h5", tmp_path / "run.csv", tmp_path / "run.png"
+    out, table, picture, series = (tmp_path / name for name in ("run.h5", "run.csv", "run.png", "series.csv"))
     methods = "open-loop,camera-model,radio-both"
-    shown = run(site, "-o", out, "--methods", methods, "--csv", table, "--picture", picture, "--json")
+    shown = run(
+        site, "-o", out, "--methods", methods, "--csv", table, "--series", series, "--picture", picture, "--json"
+    )
     assert shown.exit_code == 0, shown.output
     found = json.loads(shown.stdout)
     assert found["ranking"] == ["radio-both", "camera-model", "open-loop"]
@@ -49,9 +52,19 @@ def test_table_json_csv_and_picture(site, tmp_path):
     assert len(rows) == 36
     assert is_track(out)
     kept = open_track(out)
-    assert kept.as_dict() == {k: v for k, v in found.items() if k not in ("result", "csv", "picture")}
+    written = ("result", "csv", "parquet", "series", "picture")
+    assert kept.as_dict() == {k: v for k, v in found.items() if k not in written}
     mirror = [float(row["normal_rms_mrad"]) for row in rows if row["method"] == "radio-both"]
     np.testing.assert_allclose(mirror, 1e3 * kept.methods["radio-both"].scores["heliostat_rms_rad"], rtol=1e-5)
+    with series.open() as file:
+        course = [row for row in csv.DictReader(file) if row["method"] == "radio-both"]
+    assert len(course) == len(kept.unix_s)
+    flux = [float(row["flux"] or "nan") for row in course]
+    np.testing.assert_allclose(flux, kept.methods["radio-both"].series["flux"], rtol=1e-5)
+    error = [float(row["normal_H01_mrad"] or "nan") for row in course]
+    np.testing.assert_allclose(error, 1e3 * kept.methods["radio-both"].series["error_rad"][:, 0], rtol=1e-5)
+    tracking = [int(row["mirrors_track"]) for row in course]
+    assert tracking == kept.methods["radio-both"].series["mode_count"][:, Mode.TRACK].tolist()
     assert kept.scenario == load_scenario(site)
     assert kept.methods["radio-both"].series["normal_enu"].shape == (len(kept.unix_s), len(kept.stored), 3)
     plain = run(site, "-o", tmp_path / "again.h5", "--methods", "open-loop")

@@ -13,7 +13,7 @@ import pytest
 from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.multilat import PoseStatus, joint_covariance, mirror_normal
-from rfpose.pipeline.evaluate import Statistics, evaluate, read_truth
+from rfpose.pipeline.evaluate import Statistics, evaluate, ratio_of, read_truth
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import write_result
 from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
@@ -221,3 +221,29 @@ def test_bad_json_is_named(result: Result, tmp_path: Path, text: str, message: s
     (tmp_path / "truth.json").write_text(text)
     with pytest.raises(RecordingError, match=r"truth\.json: " + ".*" + message):
         read_truth(tmp_path / "truth.json", result.scenario)
+
+
+@pytest.mark.parametrize("common", ["nothing", "a mirror's errors", "a frame's errors"])
+def test_ratio_scatters_as_its_sigma_says(common: str) -> None:
+    """Over many fields: errors of two axes, alone or with a part that all of a mirror's (a frame's) share."""
+    rng = np.random.default_rng(17)
+    n_frame, n_mirror, n_field = 12, 20, 800
+    bound = np.repeat(rng.uniform(0.5, 2.0, n_mirror)[None], n_frame, axis=0)
+    found = []
+    for _ in range(n_field):
+        noise = rng.normal(size=(n_frame, n_mirror, 2))
+        if common != "nothing":
+            shape = (1, n_mirror, 2) if common.startswith("a mirror") else (n_frame, 1, 2)
+            noise = np.sqrt(0.5) * (noise + rng.normal(size=shape))
+        found.append(ratio_of(1.3 * bound * np.linalg.norm(noise, axis=-1) / np.sqrt(2.0), bound))
+    ratio, sigma = np.array(found).T
+    assert np.mean(ratio) == pytest.approx(1.3, rel=0.02)
+    # 800 fields tell a scatter to 2.5 %; few frames (12) tell their own only roughly, and somewhat low
+    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(np.std(ratio), rel=0.15)
+
+
+def test_ratio_of_one_pose_has_no_scatter_to_judge_by() -> None:
+    ratio, sigma = ratio_of(np.array([[2e-3, np.nan]]), np.array([[1e-3, 1e-3]]))
+    assert ratio == pytest.approx(2.0)
+    assert math.isnan(sigma)
+    assert all(math.isnan(value) for value in ratio_of(np.full((2, 2), np.nan), np.full((2, 2), np.nan)))

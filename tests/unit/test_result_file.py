@@ -17,12 +17,14 @@ import pytest
 
 from rfpose.dsp import TonePhases
 from rfpose.errors import RecordingError
+from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.pipeline.formats import result_file
-from rfpose.pipeline.formats.result import Result, frame_time
+from rfpose.pipeline.formats.result import IntegrityTable, Result, frame_time
 from rfpose.pipeline.formats.result_file import KEYS, is_result, open_result, write_result
-from rfpose.pipeline.formats.result_summary import CSV_COLUMNS, summarise, write_poses_csv
+from rfpose.pipeline.formats.result_summary import CSV_COLUMNS, pose_table, summarise, write_poses_csv
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import load_scenario
+from rfpose.tables import write_parquet
 from rfpose.truth import Truth
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
@@ -242,6 +244,36 @@ def test_csv(result: Result, tmp_path: Path) -> None:
     assert float(solved["azimuth_deg"]) == pytest.approx(180.0, abs=0.5)
     assert float(solved["elevation_deg"]) == pytest.approx(45.0, abs=0.5)
     assert float(solved["normal_sigma_mrad"]) == pytest.approx(1e3 * result.poses.sigma_rad[1, 0], abs=1e-6)
+    place = [float(solved[f"centre_{axis}_m"]) for axis in ("east", "north", "up")]
+    assert place == pytest.approx(result.poses.centre_enu_m[1, 0], abs=1e-6)
+    assert solved["receivers"] == "3"
+    assert solved["integrity"] == solved["transmitters_left_out"] == solved["protection_level_mrad"] == ""
+
+
+def test_table_tells_what_was_left_out_and_how_far_a_pose_is_protected(result: Result) -> None:
+    columns = IntegrityTable.unsolved(result.scenario, 2)
+    columns["status"][1] = IntegrityStatus.EXCLUDED, IntegrityStatus.OK
+    columns["transmitter_status"][1, :, [3, 7]] = TransmitterStatus.COMMON_ERROR
+    columns["transmitter_status"][1, 0, 1] = TransmitterStatus.NOT_RECEIVED
+    columns["protection_level_rad"][1] = 2e-3, np.inf
+    table = replace(result, integrity=IntegrityTable(**columns))
+    header, rows = pose_table(table)
+    told = [dict(zip(header, row, strict=True)) for row in rows]
+    # names mean nothing where leaving them out explains nothing; what was not received was not left out
+    assert [row["transmitters_left_out"] for row in told] == ["", "", "T4 T8", ""]
+    assert told[2]["protection_level_mrad"] == pytest.approx(2.0)
+    assert told[2]["integrity"] == IntegrityStatus.EXCLUDED.reason
+    assert told[3]["protection_level_mrad"] == np.inf
+
+
+def test_parquet_holds_the_table_with_all_its_digits(result: Result, tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    write_parquet(tmp_path / "poses.parquet", *pose_table(result))
+    found = pandas.read_parquet(tmp_path / "poses.parquet")
+    assert list(found) == list(CSV_COLUMNS)
+    np.testing.assert_array_equal(found["normal_up"], result.poses.normal_enu[..., 2].ravel())
+    assert found["time_utc"][2] == datetime(2026, 6, 21, 12, 0, 1, tzinfo=UTC)
 
 
 def test_summary_counts_mirrors_only(result: Result) -> None:

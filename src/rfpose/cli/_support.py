@@ -26,6 +26,7 @@ __all__ = [
     "check_ending",
     "check_readable",
     "check_scenario",
+    "check_table",
     "check_there",
     "common_options",
     "emit_json",
@@ -194,6 +195,15 @@ def check_ending(path: Path | None, *endings: str) -> None:
     """Refuse a name with another ending before any work is done for it."""
     if path is not None and path.suffix not in endings:
         raise InvalidInputError(f"{path}: its name must end in {', '.join(endings)}")
+
+
+def check_table(path: Path | None, *endings: str) -> None:
+    """Refuse a table that could not be written before any work is done for it."""
+    check_ending(path, *endings)
+    if path is not None and path.suffix == ".parquet":
+        from rfpose.tables import labelled_library
+
+        labelled_library("pyarrow")
 
 
 _EVERY_S = 10.0

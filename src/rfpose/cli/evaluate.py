@@ -65,7 +65,10 @@ def show_evaluation(evaluation: Evaluation, *, title: str) -> None:
         _row("receiver position [mm]", position, evaluation.bound_m, factor=1e3),
     ]
     table(title, ["error", "rms", "median", "worst", "bound"], rows)
-    say(f"rms over bound: {evaluation.ratio_to_bound:.3f} (bound from the {evaluation.bound_source}'s noise)")
+    say(
+        f"rms over bound: {evaluation.ratio_to_bound:.3f} ± {evaluation.ratio_sigma:.2g} "
+        f"(bound from the {evaluation.bound_source}'s noise)"
+    )
     protection = evaluation.protection
     if protection is not None:
         say(

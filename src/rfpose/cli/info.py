@@ -24,6 +24,11 @@ from rfpose.errors import InvalidInputError
 
 __all__ = ["command"]
 
+_MANY = ("receivers",)
+"""Tables of what is usually alike."""
+_EACH = 20
+"""Of other tables so many rows are printed each for itself."""
+
 
 @click.command(
     name="info",
@@ -85,7 +90,7 @@ def _print(data: Mapping[str, Any], *, indent: int) -> None:
         name = " " * indent + key.replace("_", " ")
         if isinstance(value, Mapping) and value and all(isinstance(item, Mapping) for item in value.values()):
             say(f"{name}: {len(value)}")
-            for row, facts in _alike(value).items():
+            for row, facts in (value if len(value) <= _EACH and key not in _MANY else _alike(value)).items():
                 say(
                     f"{' ' * indent}  {row}: "
                     + ", ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in facts.items())

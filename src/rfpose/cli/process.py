@@ -10,6 +10,7 @@ import click
 import rfpose
 from rfpose.cli._support import (
     Session,
+    check_table,
     common_options,
     emit_json,
     examples,
@@ -83,6 +84,7 @@ REFLECTION_NAMES = ("estimate", "ignore")
     help="Take receivers' places, pivots and transmitters from a file of `rfpose survey`.",
 )
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
+@click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
 @follow_links_option
 @force_option
 @common_options
@@ -99,6 +101,7 @@ def command(
     filtered: bool | None,
     survey: Path | None,
     csv_path: Path | None,
+    parquet: Path | None,
     follow_links: bool,
     force: bool,
 ) -> None:
@@ -109,8 +112,9 @@ def command(
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    claimed = outputs(output, csv_path, inputs=[recording, scenario, survey], force=force)
+    claimed = outputs(output, csv_path, parquet, inputs=[recording, scenario, survey], force=force)
     with claimed, progress("Measuring") as on_progress:
+        check_table(parquet, ".parquet")
         result = rfpose.process(
             recording,
             output,
@@ -125,13 +129,16 @@ def command(
             force=force,
             on_progress=on_progress,
         )
-        from rfpose.pipeline.formats.result_summary import write_poses_csv
+        from rfpose.pipeline.formats.result_summary import pose_table, write_poses_csv
+        from rfpose.tables import write_parquet
 
         if csv_path is not None:
             write_poses_csv(result, csv_path)
+        if parquet is not None:
+            write_parquet(parquet, *pose_table(result))
         summary = result.summary()
     if wants_json():
-        emit_json({"result": output, "csv": csv_path, **summary})
+        emit_json({"result": output, "csv": csv_path, "parquet": parquet, **summary})
         return
     table(
         str(output),

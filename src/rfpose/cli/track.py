@@ -11,6 +11,7 @@ import rfpose
 from rfpose.cli._support import (
     Session,
     check_ending,
+    check_table,
     common_options,
     emit_json,
     examples,
@@ -72,6 +73,12 @@ _METHODS = (
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
+@click.option("--parquet", type=click.Path(path_type=Path), help="The same as Parquet; needs pyarrow.")
+@click.option(
+    "--series",
+    type=click.Path(path_type=Path),
+    help="Also write one row a method and instant: errors, flux, modes; CSV, or Parquet if it ends so.",
+)
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
 @force_option
 @common_options
@@ -90,6 +97,8 @@ def command(
     check_iq: str | None,
     seed: int,
     csv_path: Path | None,
+    parquet: Path | None,
+    series: Path | None,
     picture: Path | None,
     force: bool,
 ) -> None:
@@ -101,13 +110,15 @@ def command(
     mirror normal; the beam turns by twice as much.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    check_ending(picture, ".png", ".svg")
+    check_ending(picture, ".png", ".svg", ".pdf")
+    check_table(parquet, ".parquet")
+    check_table(series, ".csv", ".parquet")
     happenings = [_event(text) for text in events]
-    claimed = outputs(output, csv_path, picture, inputs=[scenario], force=force)
+    claimed = outputs(output, csv_path, parquet, series, picture, inputs=[scenario], force=force)
     with claimed, progress("Tracking") as on_progress:
         from rfpose.drawing import save_figure
         from rfpose.pipeline.track import TrackChanges
-        from rfpose.tables import write_csv
+        from rfpose.tables import write_csv, write_parquet, write_table
 
         found = rfpose.track(
             scenario,
@@ -128,11 +139,17 @@ def command(
         )
         if csv_path is not None:
             write_csv(csv_path, *found.table())
+        if parquet is not None:
+            write_parquet(parquet, *found.table())
+        if series is not None:
+            write_table(series, *found.series_table())
         if picture is not None:
             save_figure(found.plot(), picture)
         summary = found.as_dict()
     if wants_json():
-        emit_json({"result": output, "csv": csv_path, "picture": picture, **summary})
+        emit_json(
+            {"result": output, "csv": csv_path, "parquet": parquet, "series": series, "picture": picture, **summary}
+        )
         return
     n_day = len(summary["days"])
     table(

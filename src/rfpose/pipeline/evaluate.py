@@ -15,12 +15,11 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.foreign import load_json
 from rfpose.geometry import angle_between_rad, unit
 from rfpose.multilat import FixStatus, PoseStatus, TrackStatus, position_bound
-from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
-from rfpose.pipeline.formats.result_summary import EXPLAINED, count_reasons
+from rfpose.pipeline.formats.result_summary import count_reasons, left_out_of
 from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
 from rfpose.pipeline.noise import phase_noise
 from rfpose.recording import open_recording
@@ -29,7 +28,16 @@ from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
 from rfpose.truth import Truth
 
-__all__ = ["Evaluation", "FilteredErrors", "HeliostatRow", "Protection", "Statistics", "evaluate", "read_truth"]
+__all__ = [
+    "Evaluation",
+    "FilteredErrors",
+    "HeliostatRow",
+    "Protection",
+    "Statistics",
+    "evaluate",
+    "ratio_of",
+    "read_truth",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,6 +159,8 @@ class Evaluation(Shown, Tabled):
         ``"truth"``: from the true signal-to-noise ratios. ``"result"``: from the sigmas that the result reports.
     ratio_to_bound
         RMS normal error over RMS bound.
+    ratio_sigma
+        Its standard deviation, as mirrors and frames scatter; errors that all share are not in it.
     sigma_mrad
         RMS of the standard deviations that the result reports for its normals.
     solved, failed
@@ -173,6 +183,7 @@ class Evaluation(Shown, Tabled):
     bound_m: float
     bound_source: str
     ratio_to_bound: float
+    ratio_sigma: float
     sigma_mrad: float
     solved: int
     failed: int
@@ -217,6 +228,7 @@ class Evaluation(Shown, Tabled):
             "bound_m": {"rms": self.bound_m},
             "bound_source": self.bound_source,
             "ratio_to_bound": self.ratio_to_bound,
+            "ratio_to_bound_sigma": self.ratio_sigma,
             "sigma_mrad": {"rms": self.sigma_mrad},
             "solved": self.solved,
             "failed": self.failed,
@@ -394,8 +406,7 @@ def evaluate(
     bound_m = np.where(np.isfinite(position_error), np.sqrt(np.trace(position_cov, axis1=-2, axis2=-1)), np.nan)
     sigma = np.where(solved, result.poses.sigma_rad, np.nan)
 
-    comparable = np.isfinite(bound)
-    ratio = _rms(normal_error[comparable]) / _rms(bound[comparable]) if comparable.any() else np.nan
+    ratio, ratio_sigma = ratio_of(normal_error, bound)
     return Evaluation(
         normal_error_mrad=Statistics.of(1e3 * normal_error),
         position_error_m=Statistics.of(position_error),
@@ -403,6 +414,7 @@ def evaluate(
         bound_m=_rms(bound_m),
         bound_source=noise.source,
         ratio_to_bound=ratio,
+        ratio_sigma=ratio_sigma,
         sigma_mrad=1e3 * _rms(sigma),
         solved=int(np.count_nonzero(solved)),
         failed=int(np.count_nonzero(~solved)),
@@ -423,6 +435,36 @@ def evaluate(
         protection=_protection(result, normal_error),
         filtered=_filtered(result, normal_true),
     )
+
+
+def ratio_of(error_rad: FloatArray, bound_rad: FloatArray) -> tuple[float, float]:
+    """Return RMS error (frame, heliostat) over RMS bound, and the standard deviation of this ratio; NaN: not known.
+
+    The squared ratio is one of sums; its variance is that of its residuals, summed by mirror and by frame, since a
+    mirror's errors in several frames, and a frame's in several mirrors, may have a common part [1]_.
+
+    References
+    ----------
+    .. [1] Cameron, Gelbach, Miller, Robust inference with multiway clustering, J. Bus. Econ. Stat. 29 (2011), eq. 2.7.
+    """
+    known = np.isfinite(bound_rad) & np.isfinite(error_rad)
+    allowed = float((bound_rad[known] ** 2).sum())
+    if not allowed > 0.0:
+        return float("nan"), float("nan")
+    squared = float((error_rad[known] ** 2).sum()) / allowed
+    residual = np.where(known, error_rad**2 - squared * bound_rad**2, 0.0)
+    single = _between(residual[known])
+    both = _between(residual[:, known.any(axis=0)].sum(axis=0)) + _between(residual[known.any(axis=1)].sum(axis=1))
+    # each mirror-frame stands in both sums; chance may leave less than their own scatter
+    variance = max(both - single, single) / allowed**2
+    ratio = float(np.sqrt(squared))
+    return ratio, float(np.sqrt(variance)) / (2.0 * ratio) if ratio > 0.0 and known.sum() > 1 else float("nan")
+
+
+def _between(sums: FloatArray) -> float:
+    """Return the variance of a total of independent sums whose mean is zero."""
+    n = len(sums)
+    return float((sums**2).sum()) * n / (n - 1) if n > 1 else 0.0
 
 
 def _rms(values: FloatArray) -> float:
@@ -475,8 +517,7 @@ def _protection(result: Result, normal_error: FloatArray) -> Protection | None:
     level = result.integrity.protection_level_rad
     covered = np.isfinite(level) & np.isfinite(normal_error)
     exceeded = covered & (normal_error > level)
-    explained = np.isin(result.integrity.status, EXPLAINED)
-    left_out = result.integrity.transmitter_status[explained] > TransmitterStatus.NOT_RECEIVED
+    left_out = left_out_of(result.integrity)
     return Protection(
         level_mrad=Statistics.of(1e3 * level[covered]),
         covered=int(np.count_nonzero(covered)),

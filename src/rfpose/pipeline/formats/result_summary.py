@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from datetime import datetime
+from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ __all__ = [
     "NEEDED_PROBABILITY",
     "count_reasons",
     "fix_table",
+    "left_out_of",
     "pose_table",
     "summarise",
     "write_poses_csv",
@@ -200,23 +201,57 @@ CSV_COLUMNS = (
     "normal_up",
     "normal_sigma_mrad",
     "status",
+    "centre_east_m",
+    "centre_north_m",
+    "centre_up_m",
+    "receivers",
+    "protection_level_mrad",
+    "integrity",
+    "transmitters_left_out",
 )
 
 
-_CSV_FORMATS = ("", "", "", ".6f", ".6f", ".9f", ".9f", ".9f", ".6f", "")
+_CSV_FORMATS = ("", "", "", ".6f", ".6f", ".9f", ".9f", ".9f", ".6f", "", ".6f", ".6f", ".6f", "", ".6f", "", "")
 
 
 def pose_table(result: Result) -> tuple[list[str], list[list[Any]]]:
-    """Return header and rows of the mirror normals for people: degrees, milliradians of the normal; by frame."""
+    """Return header and rows of the mirror normals for people: degrees, milliradians of the normal; by frame.
+
+    The centre is the mean of the receivers' places. ``integrity`` and ``transmitters_left_out`` (names with spaces
+    between) are empty where nothing was tested; a protection level is infinite where nothing protects the pose.
+    """
     poses, rows = result.poses, []
     azimuth, elevation, mrad = np.degrees(poses.azimuth_rad), np.degrees(poses.elevation_rad), 1e3 * poses.sigma_rad
+    tested = _tests(result)
     for i_frame, start in enumerate(result.frame_start_index):
         time = frame_time(int(start), result.sample_rate)
         for i, name in enumerate(result.scenario.heliostat_ids):
             k = (i_frame, i)
             status = PoseStatus(int(poses.status[k])).reason
-            rows.append([i_frame, time, name, azimuth[k], elevation[k], *poses.normal_enu[k], mrad[k], status])
+            pose = [azimuth[k], elevation[k], *poses.normal_enu[k], mrad[k], status]
+            rows.append([i_frame, time, name, *pose, *poses.centre_enu_m[k], int(poses.n_receiver[k]), *tested(k)])
     return list(CSV_COLUMNS), rows
+
+
+def _tests(result: Result) -> Callable[[tuple[int, int]], tuple[float, str, str]]:
+    """Return what gives a mirror-frame's protection level [mrad], integrity in words, and transmitters left out."""
+    table = result.integrity
+    if table is None:
+        return lambda _: (np.nan, "", "")
+    names = np.array(result.scenario.transmitter_ids)
+    left_out = left_out_of(table)
+
+    def of(k: tuple[int, int]) -> tuple[float, str, str]:
+        words = IntegrityStatus(int(table.status[k])).reason
+        return 1e3 * float(table.protection_level_rad[k]), words, " ".join(names[left_out[k]])
+
+    return of
+
+
+def left_out_of(table: IntegrityTable) -> npt.NDArray[np.bool_]:
+    """Return (frame, heliostat, transmitter) which the tests left out, where that explains the residuals."""
+    explained = np.isin(table.status, EXPLAINED)[..., None]
+    return np.asarray(explained & (table.transmitter_status > TransmitterStatus.NOT_RECEIVED))
 
 
 def fix_table(result: Result) -> tuple[list[str], list[list[Any]]]:
@@ -236,7 +271,7 @@ def fix_table(result: Result) -> tuple[list[str], list[list[Any]]]:
 
 
 def write_poses_csv(result: Result, path: str | Path) -> None:
-    """Write the mirror normals for people, as `pose_table` has them; numbers that are not known stay empty.
+    """Write the mirror normals for people as CSV, as `pose_table` has them; numbers that are not known stay empty.
 
     Raises
     ------
@@ -245,9 +280,7 @@ def write_poses_csv(result: Result, path: str | Path) -> None:
     """
 
     def cell(value: Any, form: str) -> Any:
-        if isinstance(value, datetime):
-            return value.isoformat(timespec="microseconds").replace("+00:00", "Z")
-        return value if not form else f"{value:{form}}" if np.isfinite(value) else ""
+        return value if not form else "" if np.isnan(value) else f"{value:{form}}"
 
     header, rows = pose_table(result)
     write_csv(path, header, [[cell(v, form) for v, form in zip(row, _CSV_FORMATS, strict=True)] for row in rows])

@@ -189,6 +189,32 @@ class Track(Shown, Tabled):
         header = ["method", "heliostat", "normal_rms_mrad", "normal_p95_mrad", "normal_worst_mrad", "intercept"]
         return header, rows
 
+    def series_table(self) -> tuple[list[str], list[list[Any]]]:
+        """Return one row a method and instant: errors [mrad], flux, mirrors in each mode, and the stored mirrors.
+
+        Times are the series' own: UTC, and local mean solar time [h].
+        """
+        modes = [k for k in range(len(Mode)) if any(m.series["mode_count"][:, k].any() for m in self.methods.values())]
+        names = [self.heliostat_ids[i] for i in self.stored]
+        header = ["method", "day", "time_utc", "solar_hour", "normal_rms_mrad", "normal_p95_mrad", "normal_worst_mrad"]
+        header += ["flux", *(f"mirrors_{MODE_NAMES[k]}" for k in modes)]
+        header += [*(f"normal_{name}_mrad" for name in names), *(f"mode_{name}" for name in names)]
+        hour = np.mod(self.unix_s / 3600.0 + (self.scenario.site.longitude_deg or 0.0) / 15.0, 24.0)
+        rows: list[list[Any]] = []
+        for name, method in self.methods.items():
+            kept = method.series
+            for k, unix_s in enumerate(self.unix_s):
+                time = datetime.datetime.fromtimestamp(float(unix_s), datetime.UTC)
+                errors = [1e3 * float(kept[key][k]) for key in ("rms_rad", "p95_rad", "worst_rad")]
+                counts = [int(kept["mode_count"][k, i]) for i in modes]
+                mine = [
+                    *(1e3 * kept["error_rad"][k]).tolist(),
+                    *(MODE_NAMES[i] if i >= 0 else "" for i in kept["mode"][k]),
+                ]
+                day = self.dates[int(self.day[k])]
+                rows.append([name, day, time, float(hour[k]), *errors, float(kept["flux"][k]), *counts, *mine])
+        return header, rows
+
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the run, format ``rfpose-tracking``.
 
