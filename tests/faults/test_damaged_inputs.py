@@ -26,6 +26,7 @@ from rfpose.pipeline.formats.result_file import open_result
 from rfpose.pipeline.formats.result_summary import write_poses_csv
 from rfpose.pipeline.formats.track_file import open_track
 from rfpose.pipeline.inspect import inspect_file
+from rfpose.pipeline.pictures.field_view import field_of_result, field_of_scenario, history
 from rfpose.pipeline.pictures.track_view import picture_of_track
 from rfpose.pipeline.process import process
 from rfpose.pipeline.samples.paint import write_json, write_paint
@@ -34,7 +35,6 @@ from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
 from rfpose.sun import Site
 from rfpose.tables import write_csv
-from rfpose.viewer.models.field_view import field_of_result, field_of_scenario, history
 
 # what is wrong may well give NaN, of which numpy warns
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")

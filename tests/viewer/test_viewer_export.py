@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import re
@@ -9,16 +10,18 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from PySide6.QtCore import QRect
 from PySide6.QtGui import QImage
 
-from rfpose.cli import _app
+from rfpose.cli import _app, plot
 from rfpose.cli import view as command
-from rfpose.errors import InvalidInputError, RecordingError, RfposeError, install_remedy
+from rfpose.errors import RecordingError, RfposeError, install_remedy
+from rfpose.pipeline.pictures.catalogue import FIGURES
+from rfpose.pipeline.pictures.results import COLOURS
 from rfpose.recording import open_recording
 from rfpose.recording.conversion import convert
 from rfpose.recording.native import NativeRecording
@@ -35,12 +38,41 @@ def test_names_of_views_are_one() -> None:
     assert command.VIEW_NAMES == export.VIEW_NAMES == tuple(kind.name for kind in VIEWS)
 
 
+def test_names_of_figures_are_one() -> None:
+    assert set(plot.FIGURE_NAMES) == {name for known in FIGURES.values() for name in known}
+    assert set(plot.COLOUR_NAMES) == set(COLOURS)
+    for kind, known in command._FIGURES.items():
+        for view, name in known.items():
+            assert name in FIGURES["recording" if view == "recording" else kind]
+
+
+@pytest.mark.parametrize("what", list(FIGURES["result"]))
+def test_every_figure_of_a_result_is_drawn(files: dict[str, Path], tmp_path: Path, what: str) -> None:
+    out = tmp_path / "figure.pdf"
+    done = CliRunner().invoke(_app.app, ["plot", str(files["result"]), "--what", what, "-o", str(out)])
+    assert done.exit_code == 0, done.output
+    assert out.read_bytes().startswith(b"%PDF")
+
+
+def test_figure_refuses_what_says_nothing_of_it(files: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "figure.png"
+    done = CliRunner().invoke(
+        _app.app, ["plot", str(files["result"]), "--what", "links", "--frame", "1", "-o", str(out)]
+    )
+    assert done.exit_code == 3
+    assert "`--frame` says nothing of figure links" in done.stderr
+    done = CliRunner().invoke(_app.app, ["plot", str(files["result"]), "--what", "course", "-o", str(out)])
+    assert done.exit_code == 3
+    assert "`--what` must be one of map, errors" in done.stderr
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("kind", "view"), [("recording", "recording"), ("result", "field"), ("scenario", "layout"), ("result", "recording")]
 )
-def test_each_view_becomes_a_picture(qapp, files: dict[str, Path], tmp_path: Path, kind: str, view: str) -> None:
+def test_each_view_becomes_a_picture(files: dict[str, Path], tmp_path: Path, kind: str, view: str) -> None:
     out = tmp_path / "out.png"
-    done = run(files[kind], "--view", view, "--save", out, "--size", 900, 600, "--json")
+    done = run(files[kind], "--view", view, "--save", out, "--json")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == {"file": str(files[kind]), "saved": str(out), "view": view}
     picture = QImage(str(out))
@@ -49,7 +81,7 @@ def test_each_view_becomes_a_picture(qapp, files: dict[str, Path], tmp_path: Pat
     assert len(colours) > 20
 
 
-def test_shown_bounds_are_those_of_the_commands(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+def test_shown_bounds_are_those_of_the_commands(qapp, files: dict[str, Path]) -> None:
     """One posture and one estimator for a scenario's figures, wherever they are shown."""
     found = CliRunner().invoke(_app.app, ["layout", "map", str(files["scenario"]), "--json"])
     mapped = json.loads(found.stdout)["normal_mrad"]
@@ -71,77 +103,108 @@ def test_shown_bounds_are_those_of_the_commands(qapp, files: dict[str, Path], tm
     shown = window.session.document.field.normal_enu[0]
     np.testing.assert_allclose(shown, open_recording(files["recording"]).truth.normal_enu[0], atol=1e-12)
     window.close()
-    evaluated = json.loads(CliRunner().invoke(_app.app, ["evaluate", str(files["result"]), "--json"]).stdout)
+
+
+def json_of(*arguments: object) -> dict[str, Any]:
+    done = CliRunner().invoke(_app.app, [*map(str, arguments), "--json"])
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def told_figures(page: str) -> list[tuple[str, str, str]]:
+    """(key, form, what is written) of every figure on a page."""
+    found = re.findall(r'data-figure="([^"]+)" data-form="([^"]+)">([^<]*)<', page)
+    return [tuple(html.unescape(part) for part in each) for each in found]
+
+
+def look_up(tree: Any, key: str) -> Any:
+    for part in key.split("."):
+        tree = tree[int(part)] if isinstance(tree, list) else tree[part]
+    return tree
+
+
+def test_figures_of_a_report_are_those_of_the_commands(files: dict[str, Path], tmp_path: Path) -> None:
+    """Each says which command prints it, and under which key."""
     report = tmp_path / "report.html"
     assert run(files["result"], "--save", report).exit_code == 0
-    row = re.search(r"mirror normal \[mrad\](.*?)</tr>", report.read_text())
-    cells = re.findall(r"<td class=n>([^<]*)</td>", row[1])
-    told = [*evaluated["normal_error_mrad"].values(), evaluated["bound_mrad"]["rms"]]
-    assert cells == [f"{value:.4g}" for value in told]
-    # the bound of the layout on the same page: of the first frame, the same solver
-    assert mapped["scenario"]["rms"] == pytest.approx(evaluated["bound_mrad"]["rms"], rel=0.1)
+    printed = {
+        "evaluate": json_of("evaluate", files["result"]),
+        "process": json_of("process", files["recording"], "-o", tmp_path / "again.h5"),
+    }
+    told = told_figures(report.read_text())
+    assert len(told) > 25
+    for key, form, text in told:
+        command, _, place = key.partition(":")
+        value = look_up(printed[command], place)
+        assert text == ("–" if value is None else format(value, form)), key
+    first = [key for key, _, _ in told[:5]]
+    assert first[:2] == ["process:poses.solved", "evaluate:normal_error_mrad.rms"]
+    # the bound of the layout: of the first frame, the same solver
+    mapped = json_of("layout", "map", files["scenario"], "--estimator", "scenario")["normal_mrad"]["scenario"]["rms"]
+    assert mapped == pytest.approx(printed["evaluate"]["bound_mrad"]["rms"], rel=0.1)
 
 
-def test_svg_holds_text_that_can_be_read(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+def test_svg_holds_text_that_can_be_read(files: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "out.svg"
     assert run(files["result"], "--heliostat", "H02", "--frame", 1, "--save", out).exit_code == 0
     texts = "".join(ET.parse(out).getroot().itertext())
-    for word in ("T10", "north [m]", "H02", "2 of 3"):
+    for word in ("T10", "north [m]", "H02", "frame 2 of 3", "error of the mirror normal ["):
         assert word in texts
 
 
-def test_other_formats_are_drawn_alike(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+def test_other_formats_are_drawn_alike(files: dict[str, Path], tmp_path: Path) -> None:
     pictures = {}
     for format in ("rfpose-iq", "digital-rf", "sigmf"):
         path = tmp_path / format
         with open_recording(files["recording"]) as recording:
             convert(recording, path, format=format)
-        done = run(path, "--save", tmp_path / f"{format}.png", "--size", 900, 600)
+        done = run(path, "--save", tmp_path / f"{format}.png")
         assert done.exit_code == 0, done.output
-        picture = QImage(str(tmp_path / f"{format}.png")).convertToFormat(QImage.Format.Format_RGB32)
-        pictures[format] = picture.copy(QRect(60, 60, 300, 150))  # the spectrum
+        pictures[format] = (tmp_path / f"{format}.png").read_bytes()
     assert pictures["digital-rf"] == pictures["rfpose-iq"] == pictures["sigmf"]
 
 
 def test_damage_found_while_drawing_is_an_error_and_no_picture(
-    qapp, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> None:
         raise RecordingError("rec.h5: cannot read sample 5; check the disk")
 
     monkeypatch.setattr(NativeRecording, "_read_segment", broken)
-    done = run(files["recording"], "--save", tmp_path / "a.png", "--size", 900, 600)
+    done = run(files["recording"], "--save", tmp_path / "a.png")
     assert done.exit_code == 3
     assert "cannot read sample 5" in done.stderr
     assert not (tmp_path / "a.png").exists()
 
 
-def test_report_is_one_file_with_pictures_tables_settings_and_versions(
-    qapp, files: dict[str, Path], tmp_path: Path
+def test_report_is_one_file_with_what_was_asked_then_pictures_then_tables(
+    files: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "report.html"
-    done = run(files["result"], "--save", out, "--size", 900, 600)
+    chosen = ("--frame", 0, "--frame", 2, "--heliostat", "H01", "--heliostat", "H02")
+    done = run(files["result"], "--save", out, *chosen)
     assert done.exit_code == 0, done.output
     page = out.read_text()
-    assert page.count("data:image/png;base64,") == 6  # recording, the field in four colourings, layout
-    assert not re.search(r'(src|href)="(?!data:)', page)
-    for word in (
-        "carrier not found above the noise",
-        "estimator",
-        "hilbert",
-        "numpy",
-        "PySide6",
-        "mirror normal [mrad]",
-    ):
+    # the map, two of its frames, errors, links, budget, two mirrors
+    assert page.count("<figure>") == 8
+    assert not re.search(r'(src|href)="(?!#|data:)', page)
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids)) > 20
+    order = [page.index(each) for each in ("How good", "<h2>Pictures", "<h2>By heliostat", '<section class="page">')]
+    assert order == sorted(order)
+    for word in ("carrier not found above the noise", "estimator", "hilbert", "numpy", "Heliostat H02", "frame 3 of 3"):
         assert word in page
     assert "[[transmitter]]" in page
+    # ink and paper are the page's, which are light on paper
+    assert "currentColor" in page
+    assert "@media screen and (prefers-color-scheme: dark)" in page
 
 
-def test_report_escapes_what_the_file_says(qapp, files: dict[str, Path], tmp_path: Path) -> None:
+def test_report_escapes_what_the_file_says(files: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "a<b>.toml"
     path.write_text(files["scenario"].read_text().replace('name = "', 'name = "<script>', 1))
     out = tmp_path / "report.html"
-    assert run(path, "--save", out, "--size", 900, 600).exit_code == 0
+    assert run(path, "--save", out).exit_code == 0
     assert "<script>" not in out.read_text()
     assert "a&lt;b&gt;.toml" in out.read_text()
 
@@ -149,34 +212,32 @@ def test_report_escapes_what_the_file_says(qapp, files: dict[str, Path], tmp_pat
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["{scenario}", "--save", "{tmp}/a.pdf"], 3, "must end in .png, .svg, .html"),
-        (["{scenario}", "--save", "{tmp}/a.png", "--view", "recording"], 3, "`recording` has nothing to show"),
+        (["{scenario}", "--save", "{tmp}/a.gif"], 3, "must end in .png, .svg, .pdf, .html"),
+        (["{scenario}", "--save", "{tmp}/a.png", "--view", "recording"], 3, "`recording` has no figure of a scenario"),
+        (["{result}", "--save", "{tmp}/a.png", "--frame", "9"], 3, "`frame` must lie between 0 and 2, got 9"),
+        (["{result}", "--save", "{tmp}/a.png", "--frame", "1", "--frame", "2"], 2, "a report (.html) takes several"),
+        (["{result}", "--save", "{tmp}/a.png", "--size", "900", "600"], 2, "--size is of the window"),
         (
-            ["{scenario}", "--save", "{tmp}/a.png", "--heliostat", "H99"],
+            ["{result}", "--save", "{tmp}/a.png", "--heliostat", "H99"],
             3,
             "no heliostat `H99`; choose one of H01, H02",
         ),
         (["{tmp}/none.h5", "--save", "{tmp}/a.png"], 3, "no such file"),
-        (["{scenario}", "--save", "{scenario}"], 3, "must end in .png, .svg, .html"),
+        (["{scenario}", "--save", "{scenario}"], 3, "must end in .png, .svg, .pdf, .html"),
         (["{scenario}", "--save", "{tmp}/old.svg"], 3, "exists already"),
         (["{scenario}", "--save", "{tmp}/no/where/a.png"], 3, "its directory does not exist"),
         (["--save", "{tmp}/a.png"], 2, "--save needs a FILE"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(
-    qapp, files: dict[str, Path], tmp_path: Path, arguments: list[str], code: int, message: str
+    files: dict[str, Path], tmp_path: Path, arguments: list[str], code: int, message: str
 ) -> None:
     (tmp_path / "old.svg").write_text("old")
-    done = run(*(part.format(tmp=tmp_path, scenario=files["scenario"]) for part in arguments))
+    done = run(*(part.format(tmp=tmp_path, scenario=files["scenario"], result=files["result"]) for part in arguments))
     assert done.exit_code == code
     assert message in done.stderr
     assert (tmp_path / "old.svg").read_text() == "old"
     assert not (tmp_path / "a.png").exists()
-
-
-def test_other_ending_is_refused_before_work(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="must end in"):
-        export.export(tmp_path / "none.h5", tmp_path / "a.pdf")
 
 
 # -- what is missing -----------------------------------------------------------------------------------------

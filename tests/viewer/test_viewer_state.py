@@ -14,8 +14,8 @@ from rfpose.errors import InvalidInputError, RecordingError, RfposeError, Scenar
 from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.formats.result_file import open_result
+from rfpose.pipeline.pictures.field_view import history, project
 from rfpose.scenario import Scenario, load_scenario, parse_scenario
-from rfpose.viewer.models.field_view import history, project
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
 from rfpose.viewer.state.observed import Event

@@ -14,8 +14,8 @@ from PySide6.QtGui import QDropEvent, QMouseEvent
 from PySide6.QtWidgets import QApplication
 
 from rfpose.errors import RecordingError
+from rfpose.pipeline.pictures.field_view import FieldPicture
 from rfpose.scenario import load_scenario
-from rfpose.viewer.models.field_view import FieldPicture
 from rfpose.viewer.preferences import Preferences
 from rfpose.viewer.state.document import Document
 from rfpose.viewer.views.field import FieldView

@@ -33,6 +33,7 @@ COMMANDS = (
     "track",
     "convert",
     "view",
+    "plot",
     "sample",
     "data",
     "warm-up",

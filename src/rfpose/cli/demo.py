@@ -18,7 +18,6 @@ from rfpose.cli._support import (
     when_written,
 )
 from rfpose.cli.evaluate import show_evaluation
-from rfpose.errors import RfposeError
 
 __all__ = ["command", "write_report"]
 
@@ -59,15 +58,9 @@ def command(session: Session, output: Path, seed: int, force: bool) -> None:
         say(f"{what.replace('_', ' ')}: {path}")
 
 
-def write_report(result: Path, report: Path) -> dict[str, Path]:
-    """Write the report where the viewer can be used, and say what it lacks where not."""
-    from rfpose.viewer.app import check_installed
-    from rfpose.viewer.export import export
+def write_report(result: Path, report: Path) -> None:
+    """Write the report of a result."""
+    from rfpose.files import write_atomically
+    from rfpose.pipeline.report import report_html
 
-    try:
-        check_installed()
-        export(result, report)
-    except RfposeError as error:
-        click.echo(f"no report: {error}", err=True)
-        return {}
-    return {"report": report}
+    write_atomically(report, report_html(result).encode())

@@ -1,10 +1,8 @@
-"""Views as pictures, and a result as one HTML file, without a screen."""
+"""Windows without a screen, and photographs of what they show."""
 
 from __future__ import annotations
 
-import base64
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,9 +14,8 @@ if TYPE_CHECKING:
 
     from rfpose.viewer.window import MainWindow
 
-__all__ = ["FORMATS", "VIEW_NAMES", "export", "open_window", "save_widget", "settle"]
+__all__ = ["VIEW_NAMES", "open_window", "png_of", "refuse_errors", "save_widget", "settle"]
 
-FORMATS = (".png", ".svg", ".html")
 VIEW_NAMES = ("recording", "field", "layout", "tracking", "live")
 _TIMEOUT_S = 300.0
 _QUIET_S = 0.35
@@ -138,90 +135,8 @@ def open_window(
     return app, window
 
 
-def export(
-    path: Path,
-    output: Path,
-    *,
-    view: str | None = None,
-    scenario_path: Path | None = None,
-    follow_links: bool = False,
-    theme: str = "light",
-    size: tuple[int, int] = (1280, 800),
-    heliostat: str | None = None,
-    transmitter: str | None = None,
-    frame: int = 0,
-) -> str:
-    """Write a view of a file as .png or .svg, or a report of it as .html; return the view's name.
-
-    Parameters
-    ----------
-    view
-        One of `VIEW_NAMES`; that which the window would open with by default.
-    size
-        Of the window [pixel].
-    heliostat, transmitter, frame
-        What is selected.
-
-    Raises
-    ------
-    InvalidInputError
-        Another ending, or a view that has nothing to show for this file.
-    RfposeError
-        The file cannot be opened, or the picture not written.
-    """
-    if output.suffix not in FORMATS:
-        raise InvalidInputError(f"{output}: a picture must end in {', '.join(FORMATS)}")
-    app, window = open_window(path, scenario_path=scenario_path, follow_links=follow_links, theme=theme, size=size)
-    try:
-        _select(window, heliostat=heliostat, transmitter=transmitter, frame=frame)
-        if output.suffix == ".html":
-            from rfpose.viewer.report import report_html
-
-            refuse_errors(window)
-            write_atomically(output, report_html(app, window).encode())
-            return "report"
-        if view is not None:
-            shown = window.views.get(view)
-            if shown is None or not shown.applies():
-                raise InvalidInputError(f"{path}: view `{view}` has nothing to show for this file")
-            window.go_to(view)
-        settle(app, window)
-        refuse_errors(window)
-        save_widget(window.views[window.current()], output)
-        return window.current()
-    finally:
-        window.close()
-        app.processEvents()
-
-
 def refuse_errors(window: MainWindow) -> None:
     """Raise what a window would say, instead of a picture with something missing."""
     message = window.session.message
     if message is not None and message.is_error:
         raise RfposeError(message.text)
-
-
-def _select(window: MainWindow, *, heliostat: str | None, transmitter: str | None, frame: int) -> None:
-    document = window.session.document
-    scenario = None if document is None else document.scenario
-    chosen: dict[str, int] = {"frame": frame}
-    for key, name, names in (
-        ("heliostat", heliostat, () if scenario is None else scenario.heliostat_ids),
-        ("transmitter", transmitter, () if scenario is None else scenario.transmitter_ids),
-    ):
-        if name is None:
-            continue
-        if name not in names:
-            listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-            raise InvalidInputError(f"there is no {key} `{name}`; choose one of {listed or 'none: no scenario'}")
-        chosen[key] = names.index(name)
-    window.session.select(**chosen)
-    window.session.playback.scrub(frame)
-
-
-def picture_tag(app: QApplication, window: MainWindow, widget: QWidget, prepare: Callable[[], None]) -> str:
-    """Return an HTML image of a widget after ``prepare``."""
-    prepare()
-    settle(app, window)
-    data = base64.b64encode(png_of(widget)).decode()
-    return f'<img alt="" src="data:image/png;base64,{data}">'

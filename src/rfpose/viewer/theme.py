@@ -11,12 +11,9 @@ import pyqtgraph as pg
 from PySide6.QtGui import QColor, QFont, QFontDatabase, QPalette
 from PySide6.QtWidgets import QApplication
 
-__all__ = ["SERIES", "STATUS_COLOURS", "Theme", "apply", "colour_table", "ensure_font", "see_through", "theme_of"]
+from rfpose.drawing import BLUE, COLOUR_MAP
 
-# Okabe and Ito's palette; yellow is left out, it cannot be seen on white
-SERIES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6BB1", "#7F7F7F", "#A6761D", "#66A61E")
-STATUS_COLOURS = ("#0072B2", "#E69F00", "#CC79A7", "#D55E00", "#56B4E9", "#7F7F7F", "#009E73", "#A6761D")
-COLOUR_MAP = "viridis"
+__all__ = ["Theme", "apply", "colour_table", "ensure_font", "see_through", "theme_of"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +51,7 @@ _LIGHT = Theme(
     accent="#0b62a8",
     warning="#a83c00",
     trace="#3c444d",
-    blue="#0072B2",
+    blue=BLUE,
 )
 _DARK = Theme(
     name="dark",

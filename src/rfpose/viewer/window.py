@@ -27,7 +27,7 @@ from PySide6.QtWidgets import (
 
 from rfpose import __version__
 from rfpose.pipeline.demo import shipped_scenario
-from rfpose.viewer.models.spectra import prepare
+from rfpose.pipeline.pictures.spectra import prepare
 from rfpose.viewer.preferences import Preferences
 from rfpose.viewer.state.document import Document, open_document
 from rfpose.viewer.state.session import Session

@@ -389,14 +389,17 @@ class Result(Shown):
 
         return dataset(self, group)
 
-    def plot(self, *, evaluation: Evaluation | None = None) -> Figure:
+    def plot(self, *, evaluation: Evaluation | None = None, frame: int | None = None) -> Figure:
         """Draw the field from above: transmitters, heliostats, their normals, and how well these are known.
 
-        With ``evaluation`` a mirror's colour is its error instead of the sigma that the result reports.
+        With ``evaluation`` a mirror's colour is its error instead of the sigma that the result reports; over all
+        frames, or of one ``frame``.
         """
+        from rfpose.drawing import look
         from rfpose.pipeline.pictures.results import draw_field_map
 
-        return draw_field_map(self, evaluation=evaluation)
+        with look():
+            return draw_field_map(self, evaluation=evaluation, frame=frame)
 
 
 LAST_TIME_S = 253_402_300_799

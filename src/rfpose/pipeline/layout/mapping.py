@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.drawing import mark_places, new_figure
+from rfpose.drawing import WIDTH_INCH, angle_unit, new_figure
 from rfpose.errors import ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.budget import make_plan, noise_bound
@@ -20,6 +20,7 @@ from rfpose.layout.sight import visible
 from rfpose.measurement import SCENARIO, first_snr
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
 from rfpose.pipeline.site import SiteForecast, forecast_normals
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, counted, number
@@ -387,21 +388,16 @@ def _without_each(study: Study, postures: list[Posture], seen: list[BoolArray] |
 
 def _drawn(found: LayoutMap, name: str) -> Figure:
     mrad = found.rms_mrad[name]
-    figure, axes = new_figure(8.4, 7.2)
-    solved = np.isfinite(mrad)
-    size = float(np.clip(4000.0 / len(mrad), 6.0, 90.0))
-    x, y = found.pivot_enu_m[:, :2].T
-    dots = axes.scatter(x[solved], y[solved], c=mrad[solved], cmap="cividis", s=size, zorder=2)
+    factor, unit = angle_unit(mrad)
+    figure, axes = new_figure(WIDTH_INCH, 6.4)
+    dots = draw_mirrors(axes, found.pivot_enu_m, factor * mrad)
     postures = f", RMS over {found.n_posture} postures" if found.n_posture > 1 else ""
-    figure.colorbar(dots, ax=axes, label=f"bound of the mirror normal{postures} [mrad]", shrink=0.85)
-    if not solved.all():
-        axes.scatter(x[~solved], y[~solved], s=size, marker="x", color="k", label="undetermined")
-    mark_places(axes, found.scenario.transmitter_enu_m, found.scenario.transmitter_ids, marker="^", label="transmitter")
-    axes.set_xlabel("east [m]")
-    axes.set_ylabel("north [m]")
-    axes.set_aspect("equal")
-    axes.grid(alpha=0.3)
+    figure.colorbar(dots, ax=axes, label=f"bound of the mirror normal{postures} [{unit}]", shrink=0.85)
+    draw_site(axes, found.scenario)
     seen = "\n(what each receiver sees past plates and tower)" if found.sight is not None else ""
-    axes.set_title(f"{found.scenario.name}: {name}, RMS {summarise(mrad)['rms']:.3g} mrad over the field{seen}")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    rms = factor * summarise(mrad)["rms"]
+    axes.set_title(f"{found.scenario.name}: {name}, RMS {rms:.3g} {unit} over the field{seen}")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    texts = [f"{n} {v:.2g}" if np.isfinite(v) else n for n, v in zip(found.heliostat_ids, factor * mrad, strict=True)]
+    finish_plan(axes, found.scenario, found.pivot_enu_m, texts)
     return figure

@@ -13,6 +13,7 @@ from rfpose.checks import FloatArray
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.geometry import unit
 from rfpose.pipeline.formats.track_file import Track
+from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Event
 
 __all__ = [
@@ -27,6 +28,8 @@ __all__ = [
     "local_hour",
     "mode_text",
     "picture_of_track",
+    "site_of_run",
+    "telling_instant",
     "what_happened",
 ]
 
@@ -39,6 +42,8 @@ _ASTRAY = 0.25
 _DAY_GAP_S = 3600.0
 """Between two simulated days the curves show a gap of this length, whatever lies between them."""
 _LOOKS_AT_SPOTS = 200
+_LIT = 0.3
+"""Of a perfect field's light: with less hardly a mirror is on the receiver yet."""
 _NAMED = 3
 """Of so many mirrors an event is told with their names."""
 
@@ -247,6 +252,31 @@ def instant_at(
         spot_m=np.stack([np.einsum("mx,mx->m", miss, right), np.einsum("mx,mx->m", miss, up)], axis=1),
         mode=mode,
     )
+
+
+def site_of_run(track: Track) -> Scenario:
+    """Return the scenario with the mirrors that were tracked, which may be more than it lists, or others."""
+    if track.scenario.heliostat_ids == track.heliostat_ids:
+        return track.scenario
+    own = {each.id: each for each in track.scenario.heliostat}
+    if all(name in own for name in track.heliostat_ids):  # the first so many
+        return track.scenario.changed(heliostat=[own[name] for name in track.heliostat_ids])
+    return track.scenario.with_field(track.pivot_enu_m, ids=track.heliostat_ids)
+
+
+def telling_instant(picture: TrackPicture, method: str) -> tuple[int, str]:
+    """Return an instant worth looking at, and why: after an alarm or the first trouble, else that of largest error."""
+    happened = [each for each in picture.happened[method] if np.isfinite(picture.place_h(each))]
+    flux = picture.flux[method]
+    for each in happened:
+        k = int(np.searchsorted(picture.hours, picture.place_h(each) - 1e-9))
+        if (each.kind == "alarm" or each.trouble) and k < picture.n_instant:
+            # an instant later mirrors are on their way
+            return min(k + 1, picture.n_instant - 1), f"after {each.mark}"
+    error = np.where(np.isfinite(flux) & (flux > _LIT), picture.rms_mrad[method], np.nan)
+    if np.isfinite(error).any():
+        return int(np.nanargmax(error)), "the largest error of mirrors on the receiver"
+    return picture.n_instant // 2, "the middle of the run"
 
 
 def _largest(values: FloatArray) -> float:

@@ -13,11 +13,11 @@ from rfpose.errors import RfposeError
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.track_file import is_track, open_track
-from rfpose.pipeline.pictures.track_view import TrackPicture, picture_of_track
+from rfpose.pipeline.pictures.field_view import FieldPicture, field_of_result, field_of_scenario
+from rfpose.pipeline.pictures.spectra import SharedRecording, viewing_frames
+from rfpose.pipeline.pictures.track_view import TrackPicture, picture_of_track, site_of_run
 from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.viewer.models.field_view import FieldPicture, field_of_result, field_of_scenario
-from rfpose.viewer.models.spectra import SharedRecording, viewing_frames
 
 __all__ = ["Document", "Kind", "open_document"]
 
@@ -100,11 +100,12 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None, 
         return _result(path)
     if path.is_file() and is_track(path):
         track = open_track(path)
+        site = site_of_run(track)
         return Document(
             path=path,
             kind="track",
-            scenario=track.scenario,
-            field=field_of_scenario(track.scenario),
+            scenario=site,
+            field=field_of_scenario(site),
             track=picture_of_track(track),
             frame_start_index=_none(),
         )

@@ -21,10 +21,11 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.checks import FloatArray
+from rfpose.drawing import PINK, SERIES, STATUS_COLOURS
 from rfpose.multilat import PoseStatus
-from rfpose.viewer.models.field_view import FieldPicture, History, history
+from rfpose.pipeline.pictures.field_view import FieldPicture, History, history
 from rfpose.viewer.state.session import Selection, Session
-from rfpose.viewer.theme import SERIES, STATUS_COLOURS, Theme
+from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.parts import Plan, Scale, Table, View, plot_in, segments
 from rfpose.viewer.views.space import Space
 from rfpose.viewer.workers import Workers
@@ -95,7 +96,7 @@ class FieldView(View):
         self.key = self.plan_plot.addLegend(offset=(8, 8), labelTextSize="8pt", brush=pg.mkBrush(theme.base))
         self.key.setVisible(False)
         self._key_items: list[Any] = []
-        self.residuals = pg.PlotCurveItem(pen=pg.mkPen("#CC79A7", width=2.5), connect="pairs")
+        self.residuals = pg.PlotCurveItem(pen=pg.mkPen(PINK, width=2.5), connect="pairs")
         self.plan_plot.addItem(self.residuals)
         self.space_layout = pg.GraphicsLayoutWidget()
         self.space = Space(self.space_layout, theme)

@@ -33,6 +33,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from rfpose.drawing import VERMILION
 from rfpose.errors import RfposeError
 from rfpose.files import write_atomically
 from rfpose.viewer.models.live_layout import (
@@ -104,7 +105,7 @@ class LayoutView(View):
         keep_axes(self.plot)
         self.dots = Dots(rim=theme.muted)
         self.plot.addItem(self.dots)
-        self.worst = pg.ScatterPlotItem(size=20, pen=pg.mkPen("#D55E00", width=2.5), brush=None)
+        self.worst = pg.ScatterPlotItem(size=20, pen=pg.mkPen(VERMILION, width=2.5), brush=None)
         self.plot.addItem(self.worst)
         self.plot.scene().sigMouseClicked.connect(self._clicked)
         self.scale = Scale(self.graphs, theme)
@@ -450,7 +451,7 @@ class LayoutView(View):
         for name in edit.ids:
             if name not in self._handles:
                 handle = pg.TargetItem(
-                    size=15, symbol="t1", pen=pg.mkPen(self.theme.text, width=1.5), brush="#D55E00",
+                    size=15, symbol="t1", pen=pg.mkPen(self.theme.text, width=1.5), brush=VERMILION,
                     hoverBrush="#E69F00", label=name,
                     labelOpts={"color": self.theme.text, "offset": (8, 8), "fill": see_through(self.theme.plot)},
                 )  # fmt: skip
@@ -471,7 +472,7 @@ class LayoutView(View):
             handle.setPos(transmitter.position_enu_m[0], transmitter.position_enu_m[1])
             locked = transmitter.id in edit.locked
             handle.movable = not locked
-            colour = self.theme.muted if locked else "#E69F00" if transmitter.id == self.chosen else "#D55E00"
+            colour = self.theme.muted if locked else "#E69F00" if transmitter.id == self.chosen else VERMILION
             handle.setBrush(pg.mkBrush(colour))
         self._filling = False
 

@@ -11,6 +11,7 @@ from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QShowEvent
 from PySide6.QtWidgets import QComboBox, QHBoxLayout, QLabel, QPushButton, QSplitter, QVBoxLayout
 
+from rfpose.drawing import PINK, VERMILION
 from rfpose.viewer.models.live_track import LivePicture, LiveTrack
 from rfpose.viewer.state.live import FACTORS, LiveRun
 from rfpose.viewer.state.session import Session
@@ -96,7 +97,7 @@ class LiveView(View):
         self.beams = pg.PlotCurveItem(pen=pg.mkPen(230, 159, 0, 120, width=1), connect="pairs")
         self.normals = pg.PlotCurveItem(pen=pg.mkPen(self.theme.trace, width=1.5), connect="pairs")
         self.dots = Dots(rim=self.theme.muted)
-        self.target = pg.ScatterPlotItem(symbol="s", size=14, pen=pg.mkPen(self.theme.text), brush="#CC79A7")
+        self.target = pg.ScatterPlotItem(symbol="s", size=14, pen=pg.mkPen(self.theme.text), brush=PINK)
         self.masts = pg.ScatterPlotItem(symbol="t1", size=14)
         for item in (self.beams, self.normals, self.dots, self.target, self.masts):
             self.plan_plot.addItem(item)
@@ -282,7 +283,7 @@ class LiveView(View):
         self.beams.setData(*segments(pivot, now.beam_end_enu_m))
         self.spots.set_data(now.spot_m[:, 0], now.spot_m[:, 1], colour, self.scale.table, 8.0)
         places = track.transmitter_enu_m
-        brush = [pg.mkBrush(self.theme.muted if n in picture.dead else "#D55E00") for n in track.transmitter_ids]
+        brush = [pg.mkBrush(self.theme.muted if n in picture.dead else VERMILION) for n in track.transmitter_ids]
         self.masts.setData(x=places[:, 0], y=places[:, 1], brush=brush)
         rows = zip(track.ids, picture.mode, now.error_mrad, picture.sigma_mrad, strict=True)
         self.table.fill([[name, does, f"{error:.3g}", f"{sigma:.3g}"] for name, does, error, sigma in rows])
@@ -294,7 +295,7 @@ class LiveView(View):
             self.curve.setData(np.array(live.seconds) / 60.0, np.where(seen, values, np.nan))
         for second, text in live.marks[len(self._lines) :]:
             line = pg.InfiniteLine(
-                second / 60.0, angle=90, pen=pg.mkPen("#D55E00", style=Qt.PenStyle.DashLine), label=text,
+                second / 60.0, angle=90, pen=pg.mkPen(VERMILION, style=Qt.PenStyle.DashLine), label=text,
                 labelOpts={"position": 0.95, "color": self.theme.text, "rotateAxis": (1, 0), "anchors": [(1, 0)] * 2},
             )  # fmt: skip
             self.curve_plot.addItem(line, ignoreBounds=True)

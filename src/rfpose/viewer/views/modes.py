@@ -9,24 +9,25 @@ import numpy as np
 import pyqtgraph as pg
 
 from rfpose.checks import FloatArray
+from rfpose.drawing import MODE_COLOURS
 from rfpose.pipeline.pictures.track_view import MODES, ON_RECEIVER, Instant, mode_text
 from rfpose.viewer.theme import Theme
 
 __all__ = ["ModeLegend", "away_marks"]
 
-_LOOKS = {
-    "stow": ("s", "#8A929B"),
-    "stowing": ("t", "#8A929B"),
-    "approach": ("t1", "#56B4E9"),
-    "point": ("o", "#35B779"),
-    "track": ("o", "#35B779"),
-    "calibrate": ("d", "#E69F00"),
-    "search": ("star", "#E69F00"),
-    "defocus": ("p", "#CC79A7"),
-    "emergency": ("x", "#D55E00"),
-    "idle": ("h", "#A6761D"),
-    "power_loss": ("t2", "#8C6BB1"),
-    "fault": ("+", "#D55E00"),
+_SYMBOLS = {
+    "stow": "s",
+    "stowing": "t",
+    "approach": "t1",
+    "point": "o",
+    "track": "o",
+    "calibrate": "d",
+    "search": "star",
+    "defocus": "p",
+    "emergency": "x",
+    "idle": "h",
+    "power_loss": "t2",
+    "fault": "+",
 }
 """Mirrors on the receiver are dots in the colour of their error; green stands for it in the key."""
 
@@ -34,12 +35,12 @@ _LOOKS = {
 def away_marks(theme: Theme, pivot_enu_m: FloatArray, now: Instant, size_px: float) -> dict[str, Any]:
     """Return what a scatter plot needs to put the marks of their modes on mirrors that are not on the receiver."""
     rows = np.flatnonzero(~now.on_receiver & (now.mode >= 0))
-    looks = [_LOOKS[MODES[k]] for k in now.mode[rows]]
+    names = [MODES[k] for k in now.mode[rows]]
     return {
         "x": pivot_enu_m[rows, 0],
         "y": pivot_enu_m[rows, 1],
-        "symbol": [symbol for symbol, _ in looks],
-        "brush": [pg.mkBrush(colour) for _, colour in looks],
+        "symbol": [_SYMBOLS[name] for name in names],
+        "brush": [pg.mkBrush(MODE_COLOURS[name]) for name in names],
         "pen": pg.mkPen(theme.text, width=1),
         "size": max(size_px - 2.0, 4.0),
     }
@@ -62,7 +63,7 @@ class ModeLegend:
             self.key.clear()
             self._modes = tuple(count)
             for k in self._modes:
-                symbol, colour = _LOOKS[MODES[k]]
+                symbol, colour = _SYMBOLS[MODES[k]], MODE_COLOURS[MODES[k]]
                 item = pg.ScatterPlotItem(symbol=symbol, size=10, brush=colour, pen=pg.mkPen(self._theme.text, width=1))
                 self.key.addItem(item, mode_text(k))
         for (_, label), k in zip(self.key.items, self._modes, strict=True):

@@ -21,7 +21,8 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.checks import FloatArray
-from rfpose.viewer.models.field_view import FieldPicture
+from rfpose.drawing import COLOUR_MAP, PINK, VERMILION
+from rfpose.pipeline.pictures.field_view import FieldPicture
 from rfpose.viewer.state.observed import Event
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme, colour_table, see_through
@@ -194,7 +195,7 @@ class Scale:
     def __init__(self, layout: Any, theme: Theme, *, row: int = 0, column: int = 1) -> None:
         self.table = [QColor(*map(int, rgb)) for rgb in colour_table(_LEVELS)] + [QColor(theme.muted)]
         self.bar = pg.ColorBarItem(
-            values=(0.0, 1.0), colorMap=pg.colormap.get("viridis"), interactive=False, width=14, label=" "
+            values=(0.0, 1.0), colorMap=pg.colormap.get(COLOUR_MAP), interactive=False, width=14, label=" "
         )
         self.bar.getAxis("right").setTextPen(theme.text)
         self.bar.getAxis("left").setTextPen(theme.text)
@@ -233,7 +234,7 @@ class Plan:
         self.dots = Dots(rim=theme.muted)
         self.picked = pg.ScatterPlotItem(size=20, pen=pg.mkPen(theme.accent, width=2.5), brush=None, pxMode=True)
         self.transmitters = pg.ScatterPlotItem(symbol="t1", size=14, pxMode=True)
-        self.calibration = pg.ScatterPlotItem(symbol="s", size=9, pen=None, brush="#CC79A7", pxMode=True)
+        self.calibration = pg.ScatterPlotItem(symbol="s", size=9, pen=None, brush=PINK, pxMode=True)
         for item in (self.lines, self.dots, self.picked, self.transmitters, self.calibration):
             plot.addItem(item)
         self.transmitters.setZValue(30)
@@ -268,7 +269,7 @@ class Plan:
             x=places[:, 0],
             y=places[:, 1],
             size=[26 if lit else 14 for lit in on],
-            brush=[pg.mkBrush("#E69F00" if lit else "#D55E00") for lit in on],
+            brush=[pg.mkBrush("#E69F00" if lit else VERMILION) for lit in on],
             pen=[pg.mkPen(self.theme.text, width=2) if lit else pg.mkPen(None) for lit in on],
         )
 

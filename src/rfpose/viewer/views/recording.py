@@ -19,9 +19,9 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from rfpose.drawing import COLOUR_MAP, SERIES
 from rfpose.errors import RfposeError
-from rfpose.recording import describe
-from rfpose.viewer.models.spectra import (
+from rfpose.pipeline.pictures.spectra import (
     FrameLook,
     PhaseTrack,
     Spectrum,
@@ -34,9 +34,10 @@ from rfpose.viewer.models.spectra import (
     spectrum,
     waterfall,
 )
+from rfpose.recording import describe
 from rfpose.viewer.state.document import Document
 from rfpose.viewer.state.session import Selection, Session
-from rfpose.viewer.theme import SERIES, Theme
+from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.parts import Plan, Table, View, plot_in
 from rfpose.viewer.workers import Workers
 
@@ -152,7 +153,7 @@ class RecordingView(View):
         self.spectrum_plot.scene().sigMouseClicked.connect(self._spectrum_clicked)
         self.waterfall_plot = plot_in(self.graphs, theme, x="frequency from the centre [MHz]", y="frame", row=1)
         self.waterfall_image = pg.ImageItem(axisOrder="row-major")
-        self.waterfall_image.setColorMap(pg.colormap.get("viridis"))
+        self.waterfall_image.setColorMap(pg.colormap.get(COLOUR_MAP))
         self.waterfall_plot.addItem(self.waterfall_image)
         self.waterfall_plot.setXLink(self.spectrum_plot)
         self.waterfall_plot.sigRangeChanged.connect(lambda *_: self._refine.start())

@@ -11,7 +11,8 @@ from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
 
 from rfpose.checks import FloatArray
-from rfpose.viewer.models.field_view import FieldPicture, project
+from rfpose.drawing import VERMILION
+from rfpose.pipeline.pictures.field_view import FieldPicture, project
 from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.parts import Dots, segments
 
@@ -55,7 +56,7 @@ class Space:
         self._masts = pg.PlotCurveItem(pen=muted, connect="pairs")
         self._normals = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1.2), connect="pairs")
         self.dots = Dots(rim=theme.muted)
-        self._tips = pg.ScatterPlotItem(symbol="t1", size=12, pen=None, brush="#D55E00")
+        self._tips = pg.ScatterPlotItem(symbol="t1", size=12, pen=None, brush=VERMILION)
         self._picked = pg.ScatterPlotItem(size=16, pen=pg.mkPen(theme.accent, width=2), brush=None)
         for item in (self._ground, self._masts, self._normals, self.dots, self._tips, self._picked):
             self.plot.addItem(item)
@@ -140,7 +141,7 @@ class Space:
             x=tips[:, 0],
             y=tips[:, 1],
             size=[22 if i == lit else 12 for i in range(len(tips))],
-            brush=[pg.mkBrush("#E69F00" if i == lit else "#D55E00") for i in range(len(tips))],
+            brush=[pg.mkBrush("#E69F00" if i == lit else VERMILION) for i in range(len(tips))],
         )
         mirrors = self._seen(field.pivot_enu_m)
         if len(self._arrow) == len(mirrors):

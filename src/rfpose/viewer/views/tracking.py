@@ -22,10 +22,12 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from rfpose.drawing import PINK
 from rfpose.pipeline.pictures.track_view import Happening, Instant, TrackPicture, clock, groups
+from rfpose.pipeline.pictures.tracking import method_colours
 from rfpose.viewer.state.playback import SPEEDS
 from rfpose.viewer.state.session import Selection, Session
-from rfpose.viewer.theme import SERIES, Theme
+from rfpose.viewer.theme import Theme
 from rfpose.viewer.views.modes import ModeLegend, away_marks
 from rfpose.viewer.views.parts import Dots, Scale, Table, View, keep_axes, pick_on_click, plot_in, segments
 from rfpose.viewer.workers import Workers
@@ -122,7 +124,7 @@ class TrackingView(View):
         self.normals = pg.PlotCurveItem(pen=pg.mkPen(theme.trace, width=1.5), connect="pairs")
         self.dots = Dots(rim=theme.muted)
         self.away = pg.ScatterPlotItem(pxMode=True)
-        self.target = pg.ScatterPlotItem(symbol="s", size=14, pen=pg.mkPen(theme.text, width=1.5), brush="#CC79A7")
+        self.target = pg.ScatterPlotItem(symbol="s", size=14, pen=pg.mkPen(theme.text, width=1.5), brush=PINK)
         self.ring = pg.ScatterPlotItem(size=24, pen=pg.mkPen(theme.accent, width=2.5), brush=None, pxMode=True)
         for item in (self.beams, self.normals, self.dots, self.away, self.target, self.ring):
             self.plan_plot.addItem(item)
@@ -210,9 +212,9 @@ class TrackingView(View):
     def _draw_curves(self, picture: TrackPicture) -> None:
         nights = np.flatnonzero(np.diff(picture.track.day)) + 1
         hours = np.insert(picture.hours, nights, np.nan)
-        for k, name in enumerate(picture.methods):
-            style = Qt.PenStyle.SolidLine if k < len(SERIES) else Qt.PenStyle.DashLine
-            pen = pg.mkPen(SERIES[k % len(SERIES)], width=1.5, style=style)
+        colours = method_colours(picture.track)
+        for name in picture.methods:
+            pen = pg.mkPen(colours[name], width=1.5)
             error, flux = (np.insert(each[name], nights, np.nan) for each in (picture.rms_mrad, picture.flux))
             if (error > 0.0).any():  # a path of nothing but NaN takes Qt down
                 positive = np.where(error > 0.0, error, np.nan)

@@ -20,7 +20,16 @@ from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result import Result, frame_time
 from rfpose.scenario import Scenario
 
-__all__ = ["Exclusion", "FieldPicture", "History", "field_of_result", "field_of_scenario", "history", "project"]
+__all__ = [
+    "Exclusion",
+    "FieldPicture",
+    "History",
+    "field_of_result",
+    "field_of_scenario",
+    "history",
+    "project",
+    "seen_transmitters",
+]
 
 _ELLIPSE_POINTS = 64
 _CHI_95 = 2.4477468306808161
@@ -187,7 +196,7 @@ def field_of_result(result: Result) -> FieldPicture:
         error_mrad=error_mrad,
         sigma_mrad=1e3 * result.poses.sigma_rad,
         status=result.poses.status,
-        n_transmitter=_seen(result),
+        n_transmitter=seen_transmitters(result),
         error_enu=error_enu,
     )
 
@@ -210,8 +219,8 @@ def _true_normals(result: Result) -> FloatArray | None:
     return normal
 
 
-def _seen(result: Result) -> npt.NDArray[np.int64]:
-    """(frame, heliostat) transmitters that the mirror's worst receiver sees."""
+def seen_transmitters(result: Result) -> npt.NDArray[np.int64]:
+    """Return (frame, heliostat) transmitters that the mirror's worst receiver sees."""
     count = np.isfinite(result.ranges.range_difference_m).sum(axis=2)
     sizes = [len(h.receiver_ids) for h in result.scenario.heliostat]
     if not sizes:
