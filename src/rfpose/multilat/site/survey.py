@@ -530,12 +530,12 @@ class _Linear:
         self._heard = heard_by(voltages, system.seen.carrier.shape, settings, poses.common)
         self._now = system.constants(change)
         nu = poses.common.tail
-        self._share = (nu + 1.0) / (nu + 3.0)
-        """Expected information of Student's t beside that of its weights."""
+        self._heavy = (nu + 3.0) / (nu + 1.0)
+        """How much more variance links have than their weights say: expected information of Student's t."""
 
     def reduced(self, row: int, rows: _Rows, worth: float) -> FloatArray:
         """Return rows (link, constant + 1) of a frame that counts so much, pose and phases taken out."""
-        size = np.sqrt(self._share * worth)
+        size = np.sqrt(worth)
         # what a camera measured does not go together over postures
         nuisance, rest = self._with_reference(row, size * rows.nuisance, size * rows.rest)
         scale = np.fmax(np.linalg.norm(nuisance, axis=0), 1e-300)
@@ -583,7 +583,7 @@ class _Linear:
         beta = np.zeros(n_tx, np.complex128)
         np.add.at(beta, transmitter, off * weight[use] / variance)
         left = np.angle(off * beta[transmitter].conj())
-        covariance = np.diag(variance / weight[use])
+        covariance = np.diag(self._heavy * variance / weight[use])
         row_of = np.full(n_link, -1, np.int64)
         row_of[use] = k
         share, touched = np.zeros(n_link, np.complex128), np.empty(n_link, np.int64)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.drawing import mark_places, new_figure
+from rfpose.drawing import VERMILION, mark_places, new_figure, place_names
 from rfpose.scenario import Scenario
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["plan_in_letters", "site_plan"]
@@ -55,13 +56,9 @@ def site_plan(scenario: Scenario) -> Figure:
             *pivot[faces, :2].T, *(width * normal[faces, :2]).T, angles="xy", scale_units="xy", scale=1.0,
             color="#0072B2", width=0.003, zorder=2,
         )  # fmt: skip
-    if len(pivot) <= _NAMED:
-        for name, place in zip(scenario.heliostat_ids, pivot, strict=True):
-            axes.annotate(name, place[:2], (5, 4), textcoords="offset points", fontsize=7, color="#004B75")
-    mark_places(axes, scenario.transmitter_enu_m, scenario.transmitter_ids, marker="^", label="transmitter")
+    mark_places(axes, scenario.transmitter_enu_m, marker="^", label="transmitter")
     if scenario.calibration_receiver:
-        names = tuple(receiver.id for receiver in scenario.calibration_receiver)
-        mark_places(axes, scenario.calibration_enu_m, names, marker="s", label="calibration receiver")
+        mark_places(axes, scenario.calibration_enu_m, marker="s", label="calibration receiver")
     if scenario.site.aim_enu_m is not None:
         axes.scatter(*scenario.site.aim_enu_m[:2], marker="*", s=140, color="#E69F00", zorder=4, label="aim point")
     axes.set_xlabel("east [m]")
@@ -70,7 +67,22 @@ def site_plan(scenario: Scenario) -> Figure:
     axes.grid(alpha=0.3)
     axes.set_title(scenario.name + (" (arrows: where mirrors face, from above)" if faces.any() else ""))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    _name(axes, scenario)
     return figure
+
+
+def _name(axes: Axes, scenario: Scenario) -> None:
+    """Write the names of what is marked; of heliostats while they are few."""
+    marked = [
+        (scenario.transmitter_ids, scenario.transmitter_enu_m, VERMILION),
+        (tuple(r.id for r in scenario.calibration_receiver), scenario.calibration_enu_m, VERMILION),
+    ]
+    if len(scenario.heliostat) <= _NAMED:
+        marked.append((scenario.heliostat_ids, scenario.pivot_enu_m, "#004B75"))
+    names = [name for ids, _, _ in marked for name in ids]
+    colours = [colour for ids, _, colour in marked for _ in ids]
+    places = np.concatenate([place.reshape(-1, 3)[:, :2] for _, place, _ in marked])
+    place_names(axes, places, names, keep_off=_places(scenario)[:, :2], colours=colours)
 
 
 def plan_in_letters(scenario: Scenario, *, width: int = 64) -> list[str]:
