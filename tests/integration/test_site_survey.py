@@ -133,6 +133,29 @@ def test_a_survey_of_another_site_is_refused(site, recording, surveyed, said):
             rf.process(recording, scenario=other, pose="site", survey=surveyed)
 
 
+def test_surveyed_delays_are_taken_out_of_what_is_processed(site, tmp_path):
+    sigma_s = 3e-11  # a centimetre
+    built = site.changed(simulation={"receiver_delay_s": sigma_s})
+    recording = rf.simulate(built, seed=3)
+    heliostats = [{**h.model_dump(exclude_none=True), "receiver_delay_sigma_s": sigma_s} for h in site.heliostat]
+    told = site.changed(heliostat=heliostats)
+    found = rf.survey(recording, tmp_path / "delays.h5", scenario=told)
+    true = 299_792_458.0 * recording.truth.receiver_delay_s[0, :9].reshape(3, 3)
+    off = found.delay_m - true
+    off -= off.mean(axis=1, keepdims=True)
+    assert np.sqrt(np.mean(off**2)) < 0.2 * 299_792_458.0 * sigma_s
+    # two of three are free about their mean
+    assert np.sum((off / found.delay_sigma_m) ** 2) < chi2.ppf(1.0 - 1e-3, 6) * 1.5
+    # places as built, so that nothing but delays is in the way: well known, they have to be out
+    exact = replace(found, receiver_mirror_m=np.array([h.receiver_mirror_m for h in site.heliostat]),
+                    receiver_cov_m2=np.zeros_like(found.receiver_cov_m2), pivot_enu_m=site.pivot_enu_m)  # fmt: skip
+    exact.save(tmp_path / "exact.h5")
+    before = rf.process(recording, scenario=told, pose="site")
+    after = rf.process(recording, scenario=told, pose="site", survey=tmp_path / "exact.h5")
+    assert np.sqrt(np.mean(after.poses.sigma_rad**2)) < np.sqrt(np.mean(before.poses.sigma_rad**2))
+    assert rms_mrad(after) < 3.0 * 1e3 * np.sqrt(np.mean(after.poses.sigma_rad**2))
+
+
 # -- mounts --------------------------------------------------------------------------------------------------
 
 

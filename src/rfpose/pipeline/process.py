@@ -138,6 +138,8 @@ def process(
             asked = {"reflection": reflection, "integrity": integrity, "filter": filtered, "survey": survey}
             settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
             truth = None if opened.truth is None else align_truth(opened.truth, site)
+        if surveyed is not None:
+            tones = surveyed.without_delays(tones, site)
         result = solve(tones, site, settings=settings, truth=truth)
         if surveyed is not None:
             result = surveyed.widened(result)

@@ -286,7 +286,7 @@ class _Tables:
         self._transmitters: tuple[str, ...] = ()
         self._place, self._place_cov = np.full((n, most, 3), np.nan), np.full((n, 3 * most, 3 * most), np.nan)
         self._pivot, self._pivot_sigma = np.empty((n, 3)), np.empty((n, 3))
-        self._delay = np.full((n, most), np.nan)
+        self._delay, self._delay_sigma = np.full((n, most), np.nan), np.full((n, most), np.nan)
         self._frames, self._rank = np.zeros(n, np.int64), np.zeros(n, np.int64)
         self._worth, self._share, self._angle = np.zeros(n), np.zeros(n), np.zeros(n)
         self._mounts: dict[int, CorrelatedFit] = {}
@@ -304,7 +304,7 @@ class _Tables:
         self._place_cov[c, : 3 * n, : 3 * n] = found.cov[:, : 3 * n, : 3 * n]
         self._pivot[c] = at.pivot_enu_m
         self._pivot_sigma[c] = np.sqrt(np.einsum("mpp->mp", found.cov)[:, 3 * n : 3 * n + 3])
-        self._delay[c, :n] = at.delay_m
+        self._delay[c, :n], self._delay_sigma[c, :n] = at.delay_m, found.delay_sigma_m
         self._frames[c], self._rank[c] = found.n_frame, found.rank
         self._worth[c] = found.n_independent
         self._share[c], self._angle[c] = found.correlation.share, found.correlation.angle_rad
@@ -336,7 +336,8 @@ class _Tables:
         return SurveyFile(
             scenario=self._site, receiver_mirror_m=self._place, receiver_cov_m2=self._place_cov,
             pivot_enu_m=self._pivot, pivot_sigma_m=self._pivot_sigma, transmitter_enu_m=self._transmitter,
-            transmitter_sigma_m=self._transmitter_sigma, delay_m=self._delay, permittivity_change=self._soil[0],
+            transmitter_sigma_m=self._transmitter_sigma, delay_m=self._delay, delay_sigma_m=self._delay_sigma,
+            permittivity_change=self._soil[0],
             permittivity_sigma=self._soil[1], frame_count=self._frames, frame_worth=self._worth,
             correlation_share=self._share, correlation_rad=self._angle, rank=self._rank, mounts=mounts,
             normal_sigma_rad=self._normal, undetermined=tuple(self._words),

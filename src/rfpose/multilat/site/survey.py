@@ -182,6 +182,16 @@ class Survey:
     rounds: int
     settled: bool
 
+    @property
+    def delay_sigma_m(self) -> FloatArray:
+        """(mirror, receiver) standard deviation of delays about a mirror's mean, which no pose depends on [m]."""
+        n_rx = self.constants.delay_m.shape[1]
+        own = self.cov[:, 3 * n_rx + 3 :, 3 * n_rx + 3 :]
+        if not own.size:
+            return np.zeros(self.constants.delay_m.shape)
+        about = np.eye(n_rx) - 1.0 / n_rx
+        return np.asarray(np.sqrt(np.einsum("rp,mpq,rq->mr", about, own, about)))
+
     def normal_cov(self, mirror: int) -> FloatArray:
         """Return the covariance of a mirror's normals over frames, and between them.
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from rfpose import __version__, geometry
 from rfpose.checks import FloatArray
+from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.feedback.correlated import AXES_AND_ZEROS
 from rfpose.feedback.correlated import CASES as MOUNT_CASES
@@ -45,6 +46,9 @@ _KEYS = {
     "transmitter_enu_m": Column(("transmitter", "xyz"), "f8", "m", "transmitters"),
     "transmitter_sigma_m": Column(("transmitter", "xyz"), "f8", "m", "standard deviation; 0: not surveyed"),
     "delay_m": Column(("heliostat", "receiver"), "f8", "m", "receivers' delays about the mirror's clock"),
+    "delay_sigma_m": Column(
+        ("heliostat", "receiver"), "f8", "m", "of a delay about the mirror's mean; 0: not surveyed"
+    ),
     "permittivity_change": Column(("part",), "f8", "1", "relative change of the ground's complex permittivity"),
     "permittivity_sigma": Column(("part",), "f8", "1", "standard deviation of that"),
     "frame_count": Column(("heliostat",), "i8", "1", "frames that told something"),
@@ -106,8 +110,8 @@ class SurveyFile:
         [m].
     transmitter_enu_m, transmitter_sigma_m : (transmitter, xyz)
         [m].
-    delay_m : (heliostat, receiver)
-        [m].
+    delay_m, delay_sigma_m : (heliostat, receiver)
+        Sigma about the mirror's mean; zero: not surveyed [m].
     permittivity_change, permittivity_sigma : (real and imaginary part,)
         Of the ground, relative.
     frame_count, frame_worth : (heliostat,)
@@ -132,6 +136,7 @@ class SurveyFile:
     transmitter_enu_m: FloatArray
     transmitter_sigma_m: FloatArray
     delay_m: FloatArray
+    delay_sigma_m: FloatArray
     permittivity_change: FloatArray
     permittivity_sigma: FloatArray
     frame_count: np.ndarray[Any, Any]
@@ -165,7 +170,9 @@ class SurveyFile:
         """
         row = {name: i for i, name in enumerate(self.scenario.heliostat_ids)}
         heliostats = []
+        # one for all, so that mirrors stay alike and are solved together
         pivot_sigma = float(np.sqrt(np.mean(self.pivot_sigma_m**2)))
+        delay_sigma = float(np.sqrt(np.nanmean(self.delay_sigma_m**2))) / scenario.radio.propagation_speed_mps
         for h in scenario.heliostat:
             if h.id not in row:
                 raise ScenarioError(f"the survey is of another site: it has no heliostat `{h.id}`; survey this site")
@@ -179,7 +186,8 @@ class SurveyFile:
             _near(f"pivot of heliostat `{h.id}`", self.pivot_enu_m[i], h.pivot_enu_m, h.pivot_sigma_m or 0.0)
             data = h.model_dump(exclude_none=True)
             data.update(receiver_mirror_m=places.tolist(), pivot_enu_m=self.pivot_enu_m[i].tolist())
-            # one for all, so that mirrors stay alike and are solved together
+            if delay_sigma > 0.0 and h.receiver_delay_sigma_s:
+                data["receiver_delay_sigma_s"] = delay_sigma
             heliostats.append({**data, "pivot_sigma_m": pivot_sigma})
         of = {t.id: k for k, t in enumerate(self.scenario.transmitter)}
         transmitters = []
@@ -190,6 +198,20 @@ class SurveyFile:
             _near(f"transmitter `{t.id}`", place, t.position_enu_m, t.survey_sigma_m)
             transmitters.append({**t.model_dump(exclude_none=True), "position_enu_m": place.tolist()})
         return scenario.changed(heliostat=heliostats, transmitter=transmitters, **self._ground(scenario))
+
+    def without_delays(self, tones: TonePhases, scenario: Scenario) -> TonePhases:
+        """Return phases without the delays that were surveyed, of a scenario that `applied` took."""
+        row = {name: i for i, name in enumerate(self.scenario.heliostat_ids)}
+        delay = np.zeros(tones.carrier.shape[1])
+        for k, h in enumerate(scenario.heliostat):
+            rows = scenario.receiver_rows(k)
+            delay[rows] = self.delay_m[row[h.id], : len(h.receiver_mirror_m)]
+        if not delay.any():
+            return tones
+        speed = scenario.radio.propagation_speed_mps
+        carrier_rad = 2.0 * np.pi / speed * delay[:, None] * scenario.carrier_rf_hz
+        tone_rad = 2.0 * np.pi * delay[:, None, None] / scenario.wavelength_m
+        return replace(tones, carrier=tones.carrier * np.exp(1j * carrier_rad), phase_rad=tones.phase_rad + tone_rad)
 
     def mounts_of(self, scenario: Scenario) -> SurveyedMounts:
         """Return the mounts of a scenario's heliostats, in its order; of one that `applied` took."""
@@ -258,6 +280,8 @@ class SurveyFile:
                 "pivot_enu_m": self.pivot_enu_m[i].tolist(),
                 "pivot_sigma_m": self.pivot_sigma_m[i].tolist(),
                 "pivot_prior_sigma_m": h.pivot_sigma_m,
+                "delay_m": self.delay_m[i, :n].tolist(),
+                "delay_sigma_m": self.delay_sigma_m[i, :n].tolist(),
                 "normal_sigma_mrad": dict(zip(CASES, (1e3 * self.normal_sigma_rad[i]).tolist(), strict=True)),
                 "mount": self._mount_as_dict(i),
             }
@@ -370,6 +394,9 @@ def read_survey(path: str | Path) -> SurveyFile:
         if not np.isfinite(values[name]).all() or (name.endswith("sigma") and (values[name] < 0.0).any()):
             raise reader.error(name, "must be finite, and a sigma not below zero")
     for i, h in enumerate(scenario.heliostat):
+        delays = np.stack([values[name][i, : len(h.receiver_mirror_m)] for name in ("delay_m", "delay_sigma_m")])
+        if not np.isfinite(delays).all() or (delays[1] < 0.0).any():
+            raise reader.error("delay_m", f"or delay_sigma_m is none for heliostat `{h.id}`")
         cov = values["receiver_cov_m2"][i, : 3 * len(h.receiver_mirror_m), : 3 * len(h.receiver_mirror_m)]
         if not _is_covariance(cov):
             raise reader.error("receiver_cov_m2", f"is no covariance for heliostat `{h.id}`")
