@@ -12,12 +12,15 @@ from rfpose.cli._app import app
 from rfpose.jit import compilations, kernel
 
 SECOND = """
-import json, sys
+import tempfile
 import rfpose as rf
 from rfpose.jit import compilations
 site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
 small = site.changed(heliostat=site.heliostat[:3], radio={"frame_samples": 16000}, simulation={"frame_count": 1})
-rf.process(rf.simulate(small, seed=3), estimator="correlator")
+with tempfile.TemporaryDirectory() as folder:
+    rf.simulate(small, seed=3).save(folder + "/r.h5")
+    rf.process(folder + "/r.h5", folder + "/p.h5", estimator="correlator")
+    rf.evaluate(folder + "/p.h5")
 rf.layout_map(small)
 print(compilations())
 """

@@ -85,7 +85,7 @@ def _name(axes: Axes, scenario: Scenario) -> None:
     place_names(axes, places, names, keep_off=_places(scenario)[:, :2], colours=colours)
 
 
-def plan_in_letters(scenario: Scenario, *, width: int = 64) -> list[str]:
+def plan_in_letters(scenario: Scenario, *, width: int = 64, height: int = 24) -> list[str]:
     """Return a plan of the site in letters, north up: what stands in the same place hides what comes before it here.
 
     ``o`` heliostats, ``p`` plates without receivers, ``C`` calibration receivers, ``*`` aim point, ``T`` transmitters.
@@ -93,15 +93,16 @@ def plan_in_letters(scenario: Scenario, *, width: int = 64) -> list[str]:
     Parameters
     ----------
     scenario
-    width
-        Letters in a line; a line is as high as two letters are wide.
+    width, height
+        Letters in a line, and lines, at most; a line is as high as two letters are wide.
     """
     places = _places(scenario)
     if not len(places):
         return []
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
-    step = max(float((high - low)[0]), 2.0 * float((high - low)[1]) / 3.0, 1e-6) / (width - 1)
-    grid = np.full((round(float((high - low)[1]) / (2.0 * step)) + 1, width), " ", dtype="<U1")
+    east, north = (high - low).tolist()
+    step = max(east / (width - 1), north / (2 * (height - 1)), 1e-6)
+    grid = np.full((round(north / (2.0 * step)) + 1, width), " ", dtype="<U1")
     for letter, some in _groups(scenario):
         column = np.rint((some[:, 0] - low[0]) / step).astype(np.int64)
         row = np.rint((high[1] - some[:, 1]) / (2.0 * step)).astype(np.int64)
