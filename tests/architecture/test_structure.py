@@ -51,3 +51,22 @@ def test_reordered_sums_are_not_called_from_kernels(path):
     for function in functions:
         called = {n.func.id for n in ast.walk(function) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
         assert not called & fast, f"{function.name} calls {called & fast}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT / "src")))
+def test_private_names_stay_in_their_module(path):
+    """A name that begins with an underscore is its module's own, a module of such a name its package's own."""
+    source = ROOT / "src"
+    here = path.relative_to(source).parts
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not (isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rfpose")):
+            continue
+        parts = tuple(node.module.split("."))
+        for name in (alias.name for alias in node.names):
+            private = name.startswith("_") and not name.startswith("__")
+            is_module = (source.joinpath(*parts) / f"{name}.py").exists()
+            assert not private or is_module, f"{node.module}.{name} is that module's own"
+            whole = (*parts, name) if is_module else parts
+            for depth, part in enumerate(whole):
+                if part.startswith("_"):
+                    assert here[:depth] == whole[:depth], f"{'.'.join(whole)} is the package's own"
