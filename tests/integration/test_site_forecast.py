@@ -279,3 +279,26 @@ def test_transmitters_placed_for_pose_site_are_what_its_map_says() -> None:
     assert told["value"] < told["before"]
     assert told["without_worst"] > told["value"]
     np.testing.assert_array_equal(found.scenario.transmitter_enu_m[:8], few.transmitter_enu_m[:8])
+
+
+def test_carriers_of_one_antenna_share_what_is_wrong_with_its_rays() -> None:
+    """A second carrier at nearly the same frequency tells nothing new of a reflection, unless it is another antenna."""
+    one = site(ground=False, plate=True, floor=5.0)
+    rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in one.mirrors]))
+
+    def of_rays(scenario: Scenario) -> float:
+        ((_, foreseen),) = foreseen_mirrors(scenario, rot)
+        return float(sum(np.trace(foreseen.share(kind), axis1=1, axis2=2).sum() for kind in ("specular", "diffracted")))
+
+    each = [t.model_dump(exclude_none=True) for t in one.transmitter]
+    told: dict[str, float] = {}
+    for name, place, mast in (("same", 0.0, True), ("other", 1e-4, False)):
+        more = [
+            {**t, "id": f"{t['id']}b", "carrier_hz": t["carrier_hz"] + 30e3}
+            | {"position_enu_m": (t["position_enu_m"][0] + place, *t["position_enu_m"][1:])}
+            | ({"mast": t["id"]} if mast else {})
+            for t in each
+        ]
+        told[name] = of_rays(one.changed(transmitter=[*each, *more]))
+    # errors of independent rays average to a half; the floor is so high that they do not change the weights
+    assert told["same"] / told["other"] == pytest.approx(2.0, rel=0.03)

@@ -74,6 +74,8 @@ def test_unit_table_is_the_papers():
         ("carrier_hz = -14e6", "carrier_hz = -18e6", "collide"),
         ("carrier_hz = -18e6", "carrier_hz = -19.9e6", "outside the recorded band"),
         ("[50.0, 86.6, 30.0]", "[100.0, 0.0, 20.0]", "`T1` and `T2` stand at the same place"),
+        ('id = "T2"', 'id = "T2"\nmast = "T1"', "`T2` is one more carrier of `T1`.*same"),
+        ('id = "T2"', 'id = "T2"\nmast = "T99"', "`T2` is one more carrier of `T99`"),
         ('id = "T2"', 'id = "T1"', "transmitter `T1` appears twice"),
         ('id = "H02"', 'id = "H01"', "`H01` appears twice"),
         ("[-0.4994, 0.865, 0.0]", "[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]", ""),

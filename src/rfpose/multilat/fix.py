@@ -181,7 +181,7 @@ def locate(
     InvalidInputError
         Wrong shape, non-finite transmitter, ``sigma_m <= 0``, a setting out of range.
     GeometryError
-        Too few transmitters for any row, two at the same place, or all on a line.
+        Transmitters at too few places for any row, or all on a line.
 
     Notes
     -----
@@ -228,19 +228,12 @@ def check_transmitters(transmitter_enu_m: npt.ArrayLike) -> FloatArray:
         raise InvalidInputError(
             f"`transmitter_enu_m` must have shape (transmitter, 3) or (transmitter, 2), got {array.shape}"
         )
+    n = len(np.unique(array, axis=0))  # several carriers of one antenna are one place
     if n < n_axis + 2:
         raise GeometryError(
-            f"`transmitter_enu_m` must hold {n_axis + 2} or more transmitters to solve {n_axis} dimensions from "
-            f"range differences, got {n}; add transmitters"
+            f"`transmitter_enu_m` must hold {n_axis + 2} or more places to solve {n_axis} dimensions from range "
+            f"differences, got {n}; add transmitters"
         )
-    extent = float(np.ptp(array, axis=0).max())
-    for i in range(n - 1):
-        near = np.flatnonzero(np.linalg.norm(array[i + 1 :] - array[i], axis=1) <= 1e-9 * extent)
-        if near.size:
-            raise GeometryError(
-                f"`transmitter_enu_m` must hold different places, got "
-                f"transmitters {i} and {i + 1 + int(near[0])} at the same; move or remove one"
-            )
     singular = np.linalg.svd(array - array.mean(axis=0), compute_uv=False)
     if singular[1] <= 1e-9 * singular[0]:
         raise GeometryError("`transmitter_enu_m` must not lie on one line: a line fixes no position; move some aside")

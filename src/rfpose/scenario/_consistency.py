@@ -64,10 +64,20 @@ def _check_things(s: Scenario) -> None:
 
 
 def _check_transmitters_apart(s: Scenario) -> None:
+    place = {t.id: t for t in s.transmitter if t.mast is None}
+    for t in s.transmitter:
+        if t.mast is not None and (t.mast not in place or place[t.mast].position_enu_m != t.position_enu_m):
+            raise ValueError(
+                f"transmitter `{t.id}` is one more carrier of `{t.mast}`, which must be another transmitter, at the "
+                "same `position_enu_m` and without a `mast` itself"
+            )
     for (i, a), (j, b) in itertools.combinations(enumerate(s.transmitter_enu_m), 2):
-        if np.linalg.norm(a - b) < 1e-6:
+        if s.mast[i] != s.mast[j] and np.linalg.norm(a - b) < 1e-6:
             ids = s.transmitter_ids
-            raise ValueError(f"transmitters `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one")
+            raise ValueError(
+                f"transmitters `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one, or give the "
+                f'second `mast = "{ids[i]}"` if it is one more carrier of that antenna'
+            )
 
 
 def _check_lines_in_band(s: Scenario) -> None:

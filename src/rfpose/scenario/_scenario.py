@@ -78,6 +78,17 @@ class Scenario(Record):
         return read_only(np.array([t.position_enu_m for t in self.transmitter], np.float64))
 
     @cached_property
+    def mast(self) -> npt.NDArray[np.int64]:
+        """(transmitter,) at which antenna each carrier is sent, by the first transmitter there."""
+        at = {t.id: k for k, t in enumerate(self.transmitter)}
+        return np.array([at.get(t.mast or t.id, k) for k, t in enumerate(self.transmitter)], np.int64)
+
+    @cached_property
+    def mast_enu_m(self) -> FloatArray:
+        """(mast, xyz) places of the transmitters, each once [m]."""
+        return self.transmitter_enu_m[np.unique(self.mast)]
+
+    @cached_property
     def carrier_hz(self) -> FloatArray:
         """(transmitter,) carrier offsets from the centre frequency [Hz]."""
         return read_only(np.array([t.carrier_hz for t in self.transmitter], np.float64))

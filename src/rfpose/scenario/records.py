@@ -70,6 +70,8 @@ class Transmitter(Record):
     id: Identifier
     position_enu_m: Point
     carrier_hz: float
+    mast: Identifier | None = None
+    """Another transmitter, at whose antenna it is one more carrier."""
     amplitude: Positive = 1.0
     survey_sigma_m: NonNegative = 0.0
     """How well its place is surveyed, each axis; `rfpose survey` may move it so far."""

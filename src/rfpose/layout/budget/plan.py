@@ -246,7 +246,8 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
     """
     if pose not in ("rigid", "independent"):
         raise InvalidInputError(f"`pose` must be rigid or independent, got {pose!r}")
-    transmitter = check_site(scenario.transmitter_enu_m)
+    check_site(scenario.mast_enu_m)
+    transmitter = scenario.transmitter_enu_m
     if scenario.simulation.ground is not None:
         scenario.need_rf_carriers("[simulation] `ground`")
     check_unambiguous(transmitter, scenario.wavelength_m)

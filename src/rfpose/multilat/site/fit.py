@@ -133,6 +133,8 @@ class SiteKnowledge:
     unit_field : (mirror, transmitter)
         Strength of each transmitter's direct field at the pivot, in units of the voltages: what the floor is relative
         to.
+    mast : (transmitter,), optional
+        Equal for carriers of one antenna, whose rays share their factors' errors; None: one carrier each.
     """
 
     receiver_mirror_m: FloatArray
@@ -143,6 +145,7 @@ class SiteKnowledge:
     roll_sigma_rad: float
     clock_sigma_m: float
     unit_field: FloatArray
+    mast: IntArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -340,9 +343,11 @@ def fit_site(
     return fit.outcome(state, known, common)
 
 
-def heard_by(voltages: Voltages, shape: tuple[int, ...], settings: SiteSettings, common: Common) -> _kernels.Heard:
+def heard_by(
+    voltages: Voltages, shape: tuple[int, ...], mast: IntArray | None, settings: SiteSettings, common: Common
+) -> _kernels.Heard:
     """Return voltages of (mirror, receiver, transmitter) as the kernels take them."""
-    return _Prepared.of(voltages, shape).heard(settings, common)
+    return _Prepared.of(voltages, shape, mast).heard(settings, common)
 
 
 def _given(settings: SiteSettings) -> Common:
@@ -529,7 +534,7 @@ class _Fit:
 
     def prepare(self, voltages: Voltages) -> _Prepared:
         """Sort rays as the kernel wants them."""
-        return _Prepared.of(voltages, self.seen.carrier.shape)
+        return _Prepared.of(voltages, self.seen.carrier.shape, self.known.mast)
 
     def learn(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> Common:
         """Return what mirrors' residuals say of what all have in common (restricted maximum likelihood)."""
@@ -733,13 +738,14 @@ class _Prepared:
     link_of: IntArray
 
     @classmethod
-    def of(cls, voltages: Voltages, shape: tuple[int, ...]) -> _Prepared:
-        """Sort the rays of mirrors with so many receivers and transmitters."""
+    def of(cls, voltages: Voltages, shape: tuple[int, ...], mast: IntArray | None) -> _Prepared:
+        """Sort the rays of mirrors with so many receivers and transmitters, carriers of one antenna together."""
         rays = voltages.rays
         link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
         mirror, link_of = np.divmod(link, shape[1] * shape[2])
         ground = rays.kind == RayKind.GROUND
-        shared = np.where(ground, 0, link_of % shape[2])
+        sender = link_of % shape[2] if mast is None else mast[link_of % shape[2]]
+        shared = np.where(ground, 0, sender)
         thing = np.where(ground, 0, rays.thing.astype(np.int64) + 1)
         group = (thing * shape[2] + shared) * len(RayKind) + rays.kind
         order = np.lexsort((group, mirror))

@@ -326,10 +326,12 @@ def _draw_factor(mirrors: ForeseenMirrors, source: str, rng: np.random.Generator
     mine = rays.kind == kind
     mirror, link_of = np.divmod(mirrors._link[mine], shape[1] * shape[2])
     ground = kind == RayKind.GROUND
+    mast = mirrors.knowledge.mast
+    sender = link_of % shape[2] if mast is None else mast[link_of % shape[2]]
     key = np.stack([
         mirror,
         np.where(ground, 0, rays.thing[mine]),
-        np.where(ground, 0, link_of % shape[2]),
+        np.where(ground, 0, sender),
     ], axis=1)  # fmt: skip
     _, same = np.unique(key, axis=0, return_inverse=True)
     n = int(same.max(initial=-1)) + 1

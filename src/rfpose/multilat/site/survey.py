@@ -537,7 +537,7 @@ class _Linear:
         self, system: _System, poses: SitePoses, voltages: Voltages, settings: SiteSettings, change: FloatArray
     ) -> None:
         self._system, self._poses, self._voltages = system, poses, voltages
-        self._heard = heard_by(voltages, system.seen.carrier.shape, settings, poses.common)
+        self._heard = heard_by(voltages, system.seen.carrier.shape, system.known.mast, settings, poses.common)
         self._now = system.constants(change)
         nu = poses.common.tail
         self._heavy = (nu + 3.0) / (nu + 1.0)

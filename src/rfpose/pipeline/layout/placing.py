@@ -283,6 +283,10 @@ def _task(
     with naming(site):
         if not 0 <= chosen.keep <= len(now):
             raise ScenarioError(f"cannot keep {chosen.keep} transmitters, the scenario has {len(now)}")
+        if len(scenario.mast_enu_m) < len(now):
+            raise ScenarioError(
+                "a transmitter with a `mast` is no place of its own; place one carrier an antenna, then add the others"
+            )
         studied = tuple(postures_of(scenario, postures))
         if criterion == SITE:
             check_site_solvable(scenario)

@@ -108,7 +108,7 @@ def load_site(site: Site, field: Field = None) -> Scenario:
     if field is not None:
         scenario = scenario.with_field(field)
     with naming(site):
-        check_unambiguous(maps.check_site(scenario.transmitter_enu_m), scenario.wavelength_m)
+        check_unambiguous(maps.check_site(scenario.mast_enu_m), scenario.wavelength_m)
         maps.check_clear(scenario)
     return scenario
 

@@ -133,7 +133,7 @@ def design_site_tones(
     site, scenario = scenario, scenario_of(scenario)
     snr = first_snr(scenario, tone_snr_db)
     try:
-        transmitter = maps.check_site(scenario.transmitter_enu_m)
+        transmitter = maps.check_site(scenario.mast_enu_m)
         mirrors = maps.mirrors_of(scenario)
         unit = maps.normal_map(transmitter, mirrors, Noise.uniform(len(transmitter)), ESTIMATORS[estimator])
         if not np.any(np.isfinite(unit)):

@@ -138,6 +138,7 @@ def knowledge_of(
         roll_sigma_rad=known.roll_sigma_rad if known.two_axis else np.inf,
         clock_sigma_m=known.clock_sigma_m,
         unit_field=antenna.strength / reach,
+        mast=scenario.mast,
     )
 
 
