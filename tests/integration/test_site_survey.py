@@ -92,6 +92,30 @@ def test_what_was_written_comes_back(surveyed):
     assert rf.__version__ in h5py.File(again).attrs["made_by"]
 
 
+def test_all_that_was_surveyed_gets_into_the_scenario(site, surveyed):
+    found = read_survey(surveyed)
+    told = site.changed(
+        transmitter=[{**t.model_dump(exclude_none=True), "survey_sigma_m": 0.01} for t in site.transmitter],
+        reflection={"model": "fresnel", "permittivity": 10.0, "conductivity_s_per_m": 0.01},
+    )
+    moved = np.add(site.transmitter_enu_m, (0.01, -0.02, 0.03))
+    known = replace(
+        found, transmitter_enu_m=moved, permittivity_change=np.array([0.2, -0.1]),
+        permittivity_sigma=np.array([0.03, 0.02]),
+    )  # fmt: skip
+    after = known.applied(told)
+    np.testing.assert_allclose(after.transmitter_enu_m, moved)
+    np.testing.assert_allclose(after.pivot_enu_m, found.pivot_enu_m)
+    np.testing.assert_allclose([h.receiver_mirror_m for h in after.heliostat], found.receiver_mirror_m)
+    imaginary = 0.01 / (2.0 * np.pi * 433e6 * 8.8541878128e-12)
+    complex_permittivity = (10.0 - 1j * imaginary) * (1.2 - 0.1j)
+    assert after.reflection.permittivity == pytest.approx(complex_permittivity.real, rel=1e-3)
+    conductivity = -complex_permittivity.imag * 2.0 * np.pi * 433e6 * 8.8541878128e-12
+    assert after.reflection.conductivity_s_per_m == pytest.approx(conductivity, rel=1e-3)
+    assert after.multipath.permittivity_sigma == (0.03, 0.02)
+    assert {h.pivot_sigma_m for h in after.heliostat} == {float(np.sqrt(np.mean(found.pivot_sigma_m**2)))}
+
+
 def changed(site, i, **keys):
     """The heliostats of a site, one of them otherwise."""
     heliostats = [h.model_dump(exclude_none=True) for h in site.heliostat]
