@@ -199,6 +199,10 @@ def test_a_posture_that_is_repeated_counts_once(lessons, folder):
     still = site.changed(posture={"csv": str(folder / "still.csv")})
     with pytest.raises(InvalidInputError, match=r"4 postures .* of 48 mirrors in 12 frames .* from 10 or more"):
         rf.learn_pattern(recording, scenario=still)
+    frames, _ = measured_frames(recording, site, follow_links=False)
+    deaf = replace(frames, carrier=np.where(np.arange(N_FRAME)[:, None, None] < 2, frames.carrier, np.nan))
+    with pytest.raises(InvalidInputError, match=r"8 postures .* of 8 mirrors in 12 frames that were heard"):
+        learn_from_frames([deaf], site)
 
 
 def without_outline(site):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -131,25 +132,29 @@ def learn_from_frames(
     without_plate = [kind for kind in site.multipath.foresee if kind != "own_plate"]
     site = site.changed(multipath={"foresee": without_plate}, antenna={"pattern": None})
     (group,) = mirror_groups(site)
-    rows = _new_postures(commanded[:, group.column])
-    n_known = int(np.isfinite(commanded[:, group.column]).all(axis=2).sum())
+    amplitude = np.concatenate([group.of_mirrors(part.carrier) for part in parts])
+    told = (np.isfinite(amplitude).sum(axis=1) >= 2).any(axis=1).reshape(len(commanded), -1)
+    rows = _new_postures(np.where(told[..., None], commanded[:, group.column], np.nan))
+    n_known = int((told & np.isfinite(commanded[:, group.column]).all(axis=2)).sum())
     if len(rows) < _FEWEST:
         raise InvalidInputError(
             f"{len(rows)} postures of mirrors more than {np.degrees(_NEW_RAD):.0f} degree apart, of {n_known} mirrors "
-            f"in {len(commanded)} frames that know where they stand: a pattern is learned from {_FEWEST} or more, five "
-            "of each of eight mirrors are few and thirty plenty; record more postures"
+            f"in {len(commanded)} frames that were heard and know where they stand: a pattern is learned from "
+            f"{_FEWEST} or more, five of each of eight mirrors are few and thirty plenty; record more postures"
         )
     rot = rotations(commanded)
     pivot = np.tile(group.pivot_enu_m, (len(commanded), 1))
     own_rot = np.full((len(pivot), 3, 3), np.nan)
     own_rot[rows] = rot[:, group.column].reshape(-1, 3, 3)[rows]
     rays = SiteField(site, group, rot, antenna_of(site))(pivot, own_rot, _nothing_learned()).rays
+    # the other rows have no rays
+    first = rays.first[:-1].reshape(len(pivot), -1)[rows].ravel()
     found = learn_from_carriers(
         PostureCarriers(
-            amplitude=np.concatenate([group.of_mirrors(part.carrier) for part in parts]),
-            rays=rays,
-            pivot_enu_m=pivot,
-            rot_enu_from_mirror=own_rot,
+            amplitude=amplitude[rows],
+            rays=replace(rays, first=np.append(first, rays.n_ray)),
+            pivot_enu_m=pivot[rows],
+            rot_enu_from_mirror=own_rot[rows],
             wavelength_m=site.radio.propagation_speed_mps / site.carrier_rf_hz,
             rotation_sigma_rad=sigma_rad,
             pivot_sigma_m=_pivot_sigma_m(group),
