@@ -66,6 +66,7 @@ def set_up(commit: str) -> Path:
 def run(tree: Path, words: tuple[str, ...], *, folder: Path, cache: Path | None = None) -> tuple[Seconds, str]:
     """Run a command of a tree; return its seconds and what it printed."""
     environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python's own cache is part of an installation
     if cache is not None:
         environment["NUMBA_CACHE_DIR"] = str(cache)
     before, began = os.times(), time.perf_counter()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import logging
 import os
 import threading
@@ -187,10 +188,26 @@ def load_numba() -> Any:
         def on_end(self, event: event.Event) -> None:
             pass
 
+    _take_scipy_as_there()
     # OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
     event.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
     return numba
+
+
+def _take_scipy_as_there() -> None:
+    """Spare numba the loading of `scipy.linalg`, half a second, by which it only learns that scipy is installed.
+
+    Kernels with products of matrices find BLAS by themselves when they run.
+    """
+    from numba.np import linalg
+
+    ask = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = ask
 
 
 def _compiled(numba: Any, function: Function, options: dict[str, Any]) -> Function:

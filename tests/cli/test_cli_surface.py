@@ -238,3 +238,42 @@ def test_traceback_only_with_debug(tmp_path: Path) -> None:
 def test_json_has_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
     emit_json({"a": float("nan"), "b": np.array([1.0, np.inf]), "c": {"d": (np.float32(0.5), Path("x"), None, True)}})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": [1.0, None], "c": {"d": [0.5, "x", None, True]}}
+
+
+@pytest.fixture(scope="module")
+def small_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small recording, its scenario and its result."""
+    folder = tmp_path_factory.mktemp("job")
+    site = rfpose.load_scenario(rfpose.shipped_scenario("table2_100m.toml"))
+    short = site.changed(heliostat=site.heliostat[:2], radio={"frame_samples": 40_000}, simulation={"frame_count": 2})
+    short.save(folder / "site.toml")
+    rfpose.simulate(short, seed=1).save(folder / "recording.h5")
+    rfpose.process(folder / "recording.h5", folder / "result.h5")
+    return folder
+
+
+SLOW_TO_LOAD = ("scipy.linalg", "scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.signal", "matplotlib", "pvlib")
+
+
+@pytest.mark.parametrize(
+    ("words", "unloaded"),
+    [
+        ("process recording.h5 -o again.h5", (*SLOW_TO_LOAD, "rfpose.pipeline.site", "rfpose.recording.drf")),
+        ("process recording.h5 -o again.h5 --estimator correlator --force", SLOW_TO_LOAD),
+        ("evaluate result.h5", (*SLOW_TO_LOAD, "scipy.special", "rfpose.recording.drf")),
+        ("info recording.h5", (*SLOW_TO_LOAD, "scipy.special", "numba", "rfpose.recording.drf", "rfpose.dsp")),
+        ("layout map site.toml", ("scipy.stats", "scipy.optimize", "scipy.signal", "matplotlib", "pvlib")),
+    ],
+)
+def test_a_command_loads_what_it_needs(small_job: Path, words: str, unloaded: tuple[str, ...]) -> None:
+    """What is loaded, not how long it takes: start-up is most of a small job's time."""
+    code = (
+        "import sys\nfrom rfpose.cli import main\n"
+        "try: main()\n"
+        "except SystemExit as done: assert not done.code, done.code\n"
+        f"print('loaded:', [name for name in {unloaded!r} if name in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=small_job)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "loaded: []"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erfc
 
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
@@ -125,6 +124,8 @@ def _efficiency(
     Mean square of the loss's slope over the squared mean of its curvature, in two dimensions: expected for Gaussian
     noise where sigma is known or assumed, else of the residuals themselves, freed of what the parameters took up.
     """
+    from scipy.special import erfc
+
     cut = settings.huber
     tail = float(np.exp(-0.5 * cut**2))
     linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
@@ -505,6 +504,8 @@ class _Plane:
 
 def _chi2_limit(n_transmitter: IntArray, n_axis: int, probability: float) -> FloatArray:
     """Return the value that chi-squared exceeds with ``probability``, for each row's number of transmitters."""
+    from scipy.special import chdtri
+
     dof = np.arange(int(n_transmitter.max(initial=0)) + 1) - (n_axis + 1)
     return np.asarray(np.take(chdtri(np.maximum(dof, 1), probability), n_transmitter), np.float64)
 

@@ -7,7 +7,6 @@ from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erfc
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import GeometryError, InvalidInputError
@@ -254,6 +253,8 @@ def _resolve(
         fixed[:, :, 0] = np.isfinite(difference[:, :, 0]) & ~ambiguous
         so_far, so_far_variance = out[:, :, 0].copy(), variance[:, :, 0].copy()
         for q in range(1, len(wavelength_m)):
+            from scipy.special import erfc  # which one tone does without
+
             n = np.round((so_far - out[:, :, q]) / wavelength_m[q])
             out[:, :, q] += n * wavelength_m[q]
             room = wavelength_m[q] / 2.0 / np.sqrt(2.0 * (so_far_variance + variance[:, :, q]))

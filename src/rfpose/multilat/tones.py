@@ -8,8 +8,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import brentq
-from scipy.special import erfc
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
@@ -72,6 +70,8 @@ def ladder_risk(wavelength_m: npt.ArrayLike, phase_sigma_rad: float, *, n_differ
     A difference of two ranges, predicted with √2 σ_before and measured with √2 σ_tone, goes wrong beyond λ/2:
     erfc(λ/2 / (√2 · √(2σ_before² + 2σ_tone²))), as in `range_differences`.
     """
+    from scipy.special import erfc
+
     wavelength = as_float_array("wavelength_m", wavelength_m, ("tone",), positive=True)
     before = ladder_sigma_m(wavelength, phase_sigma_rad)[:-1]
     own = wavelength[1:] * phase_sigma_rad / (2.0 * np.pi)
@@ -217,6 +217,8 @@ def _design(
 
 def _least_band(longest: float, n: int, sigma: float, wanted: float) -> FloatArray:
     """Tones whose finest is the longest that is accurate enough, all tones counted."""
+    from scipy.optimize import brentq
+
     finest_alone = wanted * 2.0 * math.pi / sigma
 
     def surplus(log_shortest: float) -> float:
@@ -236,6 +238,8 @@ def _ladder(longest: float, shortest: float, n: int, sigma: float) -> FloatArray
     A step is safe by x = λ/4 / √(σ_before² + σ_tone²), its argument of erfc: for a given x each next tone follows from
     those before, and the last falls as x does.
     """
+    from scipy.optimize import brentq
+
     per_m = sigma / (2.0 * math.pi)
 
     def descend(x: float) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +28,11 @@ from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
-from rfpose.pipeline.site import SiteOutcome, check_site_solvable, solve_site_poses
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.site import SiteOutcome
 
 __all__ = ["POSES", "check_solvable", "solve"]
 
@@ -71,6 +74,8 @@ def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None =
     else:
         _check_solvable_by_differences(scenario, chosen)
     if chosen.pose == "site":
+        from rfpose.pipeline.site import check_site_solvable
+
         check_site_solvable(scenario)
     check_reflectors(scenario, reflectors_of(scenario, chosen.reflection))
 
@@ -149,6 +154,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     independent = _pose_table(poses, len(scenario.tone))
     found: RigidOutcome | SiteOutcome | None = None
     if choice.pose == "site":
+        from rfpose.pipeline.site import solve_site_poses  # propagation, which other poses do without
+
         found = solve_site_poses(
             tones, scenario, independent, sample_rate=rate_of(settings), simulated=truth is not None
         )

@@ -3,11 +3,15 @@
 `open_recording` reads any of them, `RecordingWriter` writes the first, `convert` goes between them.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from rfpose.recording.base import GapError, Recording, count_fill, frame_starts, recorded_runs
-from rfpose.recording.conversion import convert
 from rfpose.recording.opening import open_recording
 from rfpose.recording.summary import check_against, describe, note_doubts
 from rfpose.recording.writer import RecordingWriter
+
+if TYPE_CHECKING:
+    from rfpose.recording.conversion import convert
 
 __all__ = [
     "GapError",
@@ -22,3 +26,11 @@ __all__ = [
     "open_recording",
     "recorded_runs",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "convert":  # the writers of all formats, which no reader needs
+        raise AttributeError(f"module 'rfpose.recording' has no attribute {name!r}")
+    from rfpose.recording.conversion import convert
+
+    return convert

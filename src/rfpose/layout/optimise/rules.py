@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
@@ -124,5 +123,7 @@ class Costs:
             length = np.maximum(np.linalg.norm(node[:, None] - node, axis=2), 1e-6)
             standing = n_existing + 1
             length[:standing, :standing] = 1e-6
+            from scipy.sparse.csgraph import minimum_spanning_tree
+
             cable = float(minimum_spanning_tree(length).sum())
         return float(self.per_tower * len(new) + self.per_height_m * height + self.per_cable_m * cable)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
-from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
@@ -19,6 +17,9 @@ from rfpose.jit import one_thread
 from rfpose.layout.maps import Mirrors, _field, _plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 __all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "efficient", "evaluate_placement", "optimise"]
 
@@ -319,6 +320,8 @@ def optimise(
 def _problem(
     field: Mirrors, criterion: Criterion, statistic: str, sigma_m: float, existing: FloatArray, constraints: Constraints
 ) -> _Problem:
+    from scipy.spatial import KDTree
+
     corners = np.vstack([corner for zone in constraints.allowed for corner in zone.box])
     return _Problem(
         field, criterion, statistic, sigma_m, existing, constraints,
@@ -370,6 +373,8 @@ def _search(problem: _Problem, start: FloatArray) -> FloatArray | None:
     n = len(start)
     low, high = (h / problem.scale for h in problem.constraints.height_m)
     constraint: dict[str, Any] = {"type": "ineq", "fun": problem.margins, "jac": problem.margin_slopes}
+    from scipy.optimize import minimize
+
     result = minimize(  # type: ignore[call-overload]
         problem.objective,
         start.ravel() / problem.scale,

@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
@@ -85,6 +84,8 @@ class Found:
 
 def residual_probability(poses: RigidPoses) -> FloatArray:
     """Return the probability of residuals as large as these or larger."""
+    from scipy.special import chdtrc
+
     with np.errstate(invalid="ignore"):
         return np.asarray(chdtrc(np.maximum(poses.dof, 1.0), poses.chi2))
 

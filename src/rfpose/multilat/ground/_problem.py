@@ -7,7 +7,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.ground import _kernels
@@ -109,6 +108,8 @@ class State:
 
     def move(self, step: FloatArray) -> None:
         """Let poses and clocks follow a change of the coefficients, to first order."""
+        from scipy.spatial.transform import Rotation
+
         change = self.follow @ step
         self.pivot += change[:, :3]
         turn = change[:, 3:6]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erfc
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.rigid.integers import common_offset
@@ -50,6 +49,8 @@ def resolve(
     offset_m : (mirror, receiver, 1)
         Common offset of each receiver; zero where clocks leave none.
     """
+    from scipy.special import erfc
+
     seen = np.isfinite(observation.range_m)
     left = observation.range_m - predicted
     noise = np.broadcast_to(observation.sigma_m, left.shape) ** 2

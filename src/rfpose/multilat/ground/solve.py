@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
@@ -234,6 +233,8 @@ def _direct_probability(problem: Problem, start: State) -> FloatArray:
 
 
 def _probability(chi2: FloatArray, dof: FloatArray, solved: BoolArray) -> FloatArray:
+    from scipy.special import chdtrc
+
     known = solved & np.isfinite(chi2) & (dof > 0.0)
     return np.asarray(np.where(known, chdtrc(np.maximum(dof, 1e-9), np.where(known, chi2, 0.0)), np.nan))
 

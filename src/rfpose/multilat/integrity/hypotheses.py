@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri, chndtrinc, gammaincc, gammaln
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.integrity import _kernels
@@ -258,6 +257,8 @@ def _free_prior(
 
 def log_probability(stat: FloatArray, dof: IntArray) -> FloatArray:
     """Logarithm of the probability that chi² of ``dof`` exceeds ``stat``; 0 without degrees of freedom."""
+    from scipy.special import gammaincc, gammaln
+
     half, x = np.maximum(dof, 1) / 2.0, np.maximum(stat, 0.0) / 2.0
     far = x > 300.0 + half
     with np.errstate(divide="ignore"):
@@ -269,11 +270,15 @@ def log_probability(stat: FloatArray, dof: IntArray) -> FloatArray:
 
 def limit(probability: float | FloatArray, dof: IntArray) -> FloatArray:
     """Value that chi² of ``dof`` exceeds with ``probability``."""
+    from scipy.special import chdtri
+
     return np.asarray(np.where(dof > 0, chdtri(np.maximum(dof, 1), probability), np.inf))
 
 
 def noncentrality(threshold: FloatArray, dof: IntArray, missed: float) -> FloatArray:
     """Noncentrality at which a chi² of ``dof`` stays below ``threshold`` with probability ``missed``."""
+    from scipy.special import chndtrinc
+
     out = np.full(dof.shape, np.inf)
     for d in np.unique(dof[dof > 0]):
         at = dof == d

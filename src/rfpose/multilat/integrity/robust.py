@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
@@ -210,6 +209,8 @@ def _with_clock(problem: _Rows, position: FloatArray) -> FloatArray:
 
 def _start(problem: _Rows, position: FloatArray) -> FloatArray:
     """Least squares from the plain fixes, and where these are unlikely or missing from places all around."""
+    from scipy.special import chdtrc
+
     centre = problem.transmitter.mean(axis=0)
     size = np.sqrt(np.mean(np.sum((problem.transmitter - centre) ** 2, axis=1)))
     height = np.where(problem.seen[:, -1], problem.value[:, -1], centre[2])
@@ -294,6 +295,8 @@ def _cut_cost(problem: _Rows, state: FloatArray, outlier_sigma: float) -> FloatA
 
 def _without_one(problem: _Rows, state: FloatArray, plain: FloatArray, outlier_sigma: float) -> FloatArray:
     """Solve rows whose plain residuals are unlikely without each observation in turn; keep what fits most."""
+    from scipy.special import chdtrc
+
     dof = problem.seen.sum(axis=1) - 4
     rows = np.flatnonzero((chdtrc(np.maximum(dof, 1), _chi2(problem, plain)) < RESTART_PROBABILITY) & (dof > 1))
     if not rows.size:
@@ -322,6 +325,8 @@ def _result(
     min_probability: float,
     ambiguous: BoolArray,
 ) -> RobustFixes:
+    from scipy.special import chdtrc
+
     left = problem.left(state)
     used = problem.seen & ~outlier
     chi2 = np.sum(np.where(used, problem.weight * left**2, 0.0), axis=1)

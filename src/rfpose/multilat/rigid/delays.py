@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
@@ -95,6 +94,8 @@ def learn_delays(
     InvalidInputError
         Shapes that do not fit, time going back, a negative rate.
     """
+    from scipy.special import chdtri
+
     pivot = np.array(as_float_array("pivot_enu_m", pivot_enu_m, ("frame", "mirror", 3), finite=False))
     n_frame, n_mirror = pivot.shape[:2]
     rot = np.array(as_float_array("rot_enu_from_mirror", rot_enu_from_mirror, (n_frame, n_mirror, 3, 3), finite=False))

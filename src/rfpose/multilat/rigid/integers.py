@@ -13,7 +13,6 @@ from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc, erfc
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
@@ -322,6 +321,8 @@ def _placed(poses: RigidPoses, rows: IntArray, other: RigidPoses) -> RigidPoses:
 
 def _is_unlikely(poses: RigidPoses) -> BoolArray:
     """Not solved, or with residuals that noise hardly makes."""
+    from scipy.special import chdtrc
+
     with np.errstate(invalid="ignore"):
         rare = chdtrc(np.maximum(poses.dof, 1.0), poses.chi2) < _UNLIKELY
     return np.asarray(rare | (poses.status == PoseStatus.NOT_CONVERGED))
@@ -329,6 +330,8 @@ def _is_unlikely(poses: RigidPoses) -> BoolArray:
 
 def _round(observation: Observation, prediction: Prediction, known: Knowledge) -> tuple[FloatArray, FloatArray]:
     """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
+    from scipy.special import erfc
+
     slope = prediction.slope
     wavelength = observation.wavelength_m
     left = observation.range_m - prediction.distance_m

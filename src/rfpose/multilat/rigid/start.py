@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from rfpose.checks import FloatArray, as_float_array
 
@@ -60,6 +59,8 @@ def rotations_from_differences(
         ``rot_enu_from_mirror``, to begin from: what the mirror's size over its distance changes is left out. NaN where
         fewer than two receivers share two transmitters.
     """
+    from scipy.spatial.transform import Rotation
+
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
     places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
     pivot = as_float_array("pivot_enu_m", pivot_enu_m, (len(places), 3))
@@ -113,6 +114,8 @@ def _quadratic(
 
 def _minimise(info: FloatArray, target: FloatArray, trials: FloatArray) -> FloatArray:
     """Rotations R that minimise ½ r' A r − r' b, r the nine numbers of R: the best trial, then Newton's steps."""
+    from scipy.spatial.transform import Rotation
+
     flat = trials.reshape(-1, 9)
     cost = 0.5 * np.einsum("ta,mab,tb->mt", flat, info, flat, optimize=True) - target @ flat.T
     rot = trials[np.argmin(cost, axis=1)]

@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import fdtri, gammaln
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
@@ -461,6 +460,8 @@ def _soil_as(common: Common) -> dict[str, Any]:
 
 def _t_constant(nu: float) -> float:
     """Of minus twice Student's log likelihood of one residual, what does not depend on the residual."""
+    from scipy.special import gammaln
+
     return float(np.log(nu * np.pi) - 2.0 * (gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu)))
 
 
@@ -599,6 +600,8 @@ class _Fit:
 
     def outcome(self, state: _State, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""
+        from scipy.special import fdtri
+
         order = [3, 4, 5, 0, 1, 2]
         cov = state.cov[:, order][:, :, order]
         status = np.full(len(known), PoseStatus.OK, np.int64)

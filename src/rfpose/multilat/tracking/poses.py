@@ -7,7 +7,6 @@ from enum import IntEnum, IntFlag
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
@@ -211,6 +210,8 @@ def track_poses(
     ----------
     .. [1] Markley, Attitude error representations for Kalman filtering, J. Guidance 26 (2003) 311–317.
     """
+    from scipy.special import chdtri
+
     pivot = as_float_array("pivot_enu_m", pivot_enu_m, ("frame", "mirror", 3), finite=False)
     n_frame, n_mirror = pivot.shape[:2]
     rot = as_float_array("rot_enu_from_mirror", rot_enu_from_mirror, (n_frame, n_mirror, 3, 3), finite=False)

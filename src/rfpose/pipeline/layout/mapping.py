@@ -21,13 +21,14 @@ from rfpose.measurement import SCENARIO, first_snr
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
-from rfpose.pipeline.site import SiteForecast, forecast_normals
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, counted, number
 from rfpose.tables import Tabled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from rfpose.pipeline.site import SiteForecast
 
 __all__ = ["LayoutMap", "SightMap", "layout_map"]
 
@@ -339,6 +340,8 @@ def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | 
 
 def _with_site(scenario: Scenario, posture: Posture, tone_snr_db: float | None) -> SiteForecast:
     rot = np.concatenate([posture.mirrors.rot_enu_from_mirror, posture.plate_rot])
+    from rfpose.pipeline.site import forecast_normals
+
     return forecast_normals(scenario, rot, tone_snr_db=tone_snr_db)
 
 
