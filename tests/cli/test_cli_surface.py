@@ -277,3 +277,17 @@ def test_a_command_loads_what_it_needs(small_job: Path, words: str, unloaded: tu
     done = subprocess.run(command, capture_output=True, text=True, cwd=small_job)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "loaded: []"
+
+
+def test_profile_tells_where_the_time_went(small_job: Path) -> None:
+    words = ["process", str(small_job / "recording.h5"), "-o", str(small_job / "profiled.h5"), "--json"]
+    plain, profiled = (CliRunner().invoke(_app.app, [*words, *more]) for more in ([], ["--force", "--profile"]))
+    assert "profile" not in json.loads(plain.stdout)
+    profile = json.loads(profiled.stdout)["profile"]
+    seconds = profile["seconds"]
+    assert list(seconds) == ["open", "read", "tones", "calibration", "poses", "write"]
+    assert min(seconds.values()) > 0.0
+    # two mirrors of three receivers and the calibration receiver, two frames
+    assert profile["samples"] == 2 * 7 * 40_000
+    assert profile["samples_per_s"] == pytest.approx(profile["samples"] / (seconds["read"] + seconds["tones"]))
+    assert seconds[profile["bound_by"]] == max(seconds.values())

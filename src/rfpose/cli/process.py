@@ -85,6 +85,7 @@ REFLECTION_NAMES = ("estimate", "ignore")
 )
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
+@click.option("--profile", is_flag=True, help="Also tell the seconds of each stage, and what takes longest.")
 @follow_links_option
 @force_option
 @common_options
@@ -102,6 +103,7 @@ def command(
     survey: Path | None,
     csv_path: Path | None,
     parquet: Path | None,
+    profile: bool,
     follow_links: bool,
     force: bool,
 ) -> None:
@@ -113,6 +115,9 @@ def command(
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
     claimed = outputs(output, csv_path, parquet, inputs=[recording, scenario, survey], force=force)
+    from rfpose.pipeline.stages import Stages
+
+    stages = Stages()
     with claimed, progress("Measuring") as on_progress:
         check_table(parquet, ".parquet")
         result = rfpose.process(
@@ -127,6 +132,7 @@ def command(
             survey=survey,
             follow_links=follow_links,
             force=force,
+            stages=stages,
             on_progress=on_progress,
         )
         from rfpose.pipeline.formats.result_summary import pose_table, write_poses_csv
@@ -138,7 +144,8 @@ def command(
             write_parquet(parquet, *pose_table(result))
         summary = result.summary()
     if wants_json():
-        emit_json({"result": output, "csv": csv_path, "parquet": parquet, **summary})
+        told = {"profile": stages.summary()} if profile else {}
+        emit_json({"result": output, "csv": csv_path, "parquet": parquet, **summary, **told})
         return
     table(
         str(output),
@@ -153,6 +160,17 @@ def command(
             say(f"  {count} {what}: {reason}")
     for line in _findings(summary):
         say(f"  {line}")
+    if profile:
+        _say_stages(stages.summary())
+
+
+def _say_stages(profile: dict[str, Any]) -> None:
+    """Tell where the time went."""
+    table("Seconds by stage", ["", "s"], [[name, f"{value:.2f}"] for name, value in profile["seconds"].items()])
+    if profile["samples_per_s"] is not None:
+        rate, cores = profile["samples_per_s"] / 1e6, profile["cores"]
+        say(f"  {rate:,.0f} million samples a second read and measured, on {cores} cores")
+    say(f"  longest: {profile['bound_by']}")
 
 
 def _findings(summary: dict[str, Any]) -> list[str]:

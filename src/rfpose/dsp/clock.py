@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -32,17 +33,21 @@ def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], p
     """
     part = samples[:_SEARCH_SAMPLES]
     n_fft = 2 * len(part)
-    signal = part[:, 0].astype(np.float32) + 1j * part[:, 1].astype(np.float32)
-    power = np.abs(np.fft.fft(signal * np.hanning(len(part)), n_fft)) ** 2
+    signal = np.ascontiguousarray(part, np.float32).view(np.complex64)[:, 0]
+    spectrum = np.fft.fft(signal * _hanning(len(part)), n_fft)
     widest = float(np.max(np.abs(plan.cycles_per_ppm())))
     step = 0.5 / (n_fft * widest)
     n_side = int(np.ceil(plan.clock_search_ppm / step))
     candidate = step * np.arange(-n_side, n_side + 1)
-    score = np.empty(len(candidate))
-    for i, ppm in enumerate(candidate):
-        bins = np.rint(plan.line_cycles(float(ppm)) * n_fft).astype(np.int64) % n_fft
-        score[i] = power[bins].sum()
+    cycles = np.array([plan.line_cycles(float(ppm)) for ppm in candidate])
+    under = spectrum[np.rint(cycles * n_fft).astype(np.int64) % n_fft]
+    score = (under.real.astype(np.float64) ** 2 + under.imag.astype(np.float64) ** 2).sum(axis=1)
     return float(candidate[int(np.argmax(score))])
+
+
+@lru_cache(maxsize=4)
+def _hanning(n: int) -> npt.NDArray[np.float32]:
+    return np.hanning(n).astype(np.float32)
 
 
 def refine_clock(streams: LineStreams, plan: LinePlan, range_ppm: float) -> tuple[float, float, float]:

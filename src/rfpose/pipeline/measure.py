@@ -15,6 +15,7 @@ from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
 from rfpose.pipeline._workers import worker_pool
 from rfpose.pipeline.formats.journal import Entry, Journal
+from rfpose.pipeline.stages import Stages
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
@@ -62,6 +63,7 @@ def measure_tones(
     estimator: str,
     journal: Journal | None = None,
     on_progress: Callable[[int, int], None] | None = None,
+    stages: Stages | None = None,
 ) -> TonePhases:
     """Measure every tone in every frame of every receiver.
 
@@ -80,12 +82,15 @@ def measure_tones(
         What was measured before is taken from here, what is measured is added.
     on_progress
         Called with (rows done, rows in all); a row is one receiver in one frame.
+    stages
+        Takes the time of reading and of measuring.
 
     Raises
     ------
     RecordingError
         The recording is damaged, or the journal cannot be written.
     """
+    stages = Stages() if stages is None else stages
     n_receiver = len(scenario.receiver_ids)
     n_row = len(frame_start_index) * n_receiver
     tones = TonePhases.empty(
@@ -114,7 +119,10 @@ def measure_tones(
                 """Measure one receiver's rows of this entry, in order, since its clock is followed."""
                 mine = range(first + (i_receiver - first) % n_receiver, end, n_receiver)
                 for row in mine:
-                    found = _measure(extractor, reader.read(row), float(clock_ppm[i_receiver]))
+                    with stages.during("read"):
+                        samples = reader.read(row)
+                    with stages.during("tones", 0 if isinstance(samples, LineStatus) else len(samples)):
+                        found = _measure(extractor, samples, float(clock_ppm[i_receiver]))
                     tones.put(row // n_receiver, i_receiver, found)
                     clock_ppm[i_receiver] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
                 return len(mine)

@@ -15,6 +15,7 @@ from rfpose import __version__
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.journal import Journal
+from rfpose.pipeline.stages import Stages
 from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
 from rfpose.recording.members import members
 from rfpose.scenario import Scenario, scenario_of
@@ -43,6 +44,7 @@ def process(
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
     resume: bool = True,
+    stages: Stages | None = None,
 ) -> Result:
     """Find receiver positions and mirror normals in a recording.
 
@@ -77,6 +79,8 @@ def process(
         Called with (rows done, rows in all); a row is one receiver in one frame.
     resume
         False: measure everything again even if unfinished work of the same job is there.
+    stages
+        Takes the time of each stage.
 
     Raises
     ------
@@ -102,49 +106,56 @@ def process(
     >>> result.poses.normal_enu.shape
     (2, 2, 3)
     """
+    stages = Stages() if stages is None else stages
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
     scenario_file = None if isinstance(scenario, Scenario) else scenario
     with claim(output, inputs=[*read, scenario_file, survey, kept], force=force) as job:
-        given = None if scenario is None else scenario_of(scenario)
-        with _opened(recording, follow_links=follow_links) as opened:
-            site = _choose_scenario(opened, given)
-            surveyed = None
-            if survey is not None:
-                from rfpose.pipeline.formats.survey_file import read_survey
+        with contextlib.ExitStack() as open_files:
+            with stages.during("open"):
+                opened = open_files.enter_context(_opened(recording, follow_links=follow_links))
+                site = _choose_scenario(opened, None if scenario is None else scenario_of(scenario))
+                surveyed = None
+                if survey is not None:
+                    from rfpose.pipeline.formats.survey_file import read_survey
 
-                surveyed = read_survey(survey)
-                site = surveyed.applied(site)
-            check_against(opened, site)
-            starts = _frames(opened, site)
-            # compiled code, which none of the refusals above should wait for
-            from rfpose.dsp import ESTIMATORS
-            from rfpose.pipeline.choice import choose
-            from rfpose.pipeline.formats.result_file import write_result
-            from rfpose.pipeline.formats.truth_rows import align_truth
-            from rfpose.pipeline.measure import journal_key, measure_tones
-            from rfpose.pipeline.solve import check_solvable, solve
+                    surveyed = read_survey(survey)
+                    site = surveyed.applied(site)
+                check_against(opened, site)
+                starts = _frames(opened, site)
+                # compiled code, which none of the refusals above should wait for
+                from rfpose.dsp import ESTIMATORS
+                from rfpose.pipeline.choice import choose
+                from rfpose.pipeline.formats.result_file import write_result
+                from rfpose.pipeline.formats.truth_rows import align_truth
+                from rfpose.pipeline.measure import journal_key, measure_tones
+                from rfpose.pipeline.solve import check_solvable, solve
 
-            if estimator not in ESTIMATORS:
-                raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-            choice = choose(site, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
-            check_solvable(site, pose=pose, choice=choice)
-            _note_differing_receivers(opened, site)
-            note_doubts(opened)
-            journal = None
-            if kept is not None:
-                journal = Journal(kept, journal_key(opened, site, estimator), restart=force, resume=resume)
-            tones = measure_tones(opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress)
+                if estimator not in ESTIMATORS:
+                    raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
+                choice = choose(site, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
+                check_solvable(site, pose=pose, choice=choice)
+                _note_differing_receivers(opened, site)
+                note_doubts(opened)
+                journal = None
+                if kept is not None:
+                    journal = Journal(kept, journal_key(opened, site, estimator), restart=force, resume=resume)
+            tones = measure_tones(
+                opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress, stages=stages
+            )
             asked = {"reflection": reflection, "integrity": integrity, "filter": filtered, "survey": survey}
             settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
             truth = None if opened.truth is None else align_truth(opened.truth, site)
-        if surveyed is not None:
-            tones = surveyed.without_delays(tones, site)
-        result = solve(tones, site, settings=settings, truth=truth)
-        if surveyed is not None:
-            result = surveyed.widened(result)
+        with stages.during("poses"):
+            if surveyed is not None:
+                tones = surveyed.without_delays(tones, site)
+            result = solve(tones, site, settings=settings, truth=truth, stages=stages)
+            if surveyed is not None:
+                result = surveyed.widened(result)
+        stages.seconds["poses"] -= stages.seconds["calibration"]
         if output is not None:
-            write_result(result, output)
+            with stages.during("write"):
+                write_result(result, output)
         if journal is not None:
             job.afterwards(journal.remove)
         return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
+from rfpose.pipeline.stages import Stages
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
@@ -114,7 +116,14 @@ def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> No
             )
 
 
-def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str], truth: Truth | None = None) -> Result:
+def solve(
+    tones: TonePhases,
+    scenario: Scenario,
+    *,
+    settings: Mapping[str, str],
+    truth: Truth | None = None,
+    stages: Stages | None = None,
+) -> Result:
     """Find receiver positions and mirror normals from tone phases.
 
     Parameters
@@ -128,6 +137,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
         and ``filter`` choose the estimator of poses; without them the scenario does.
     truth
         Kept with the result.
+    stages
+        Takes the time of the calibration.
 
     Raises
     ------
@@ -136,7 +147,8 @@ def solve(tones: TonePhases, scenario: Scenario, *, settings: Mapping[str, str],
     """
     choice = PoseChoice.of(settings, scenario)
     check_solvable(scenario, pose=settings["pose"], choice=choice)
-    calibration = calibrate(tones, scenario) if is_calibrated(scenario) else _no_calibration(tones)
+    with contextlib.nullcontext() if stages is None else stages.during("calibration"):
+        calibration = calibrate(tones, scenario) if is_calibrated(scenario) else _no_calibration(tones)
     ranges = _ranges(tones, calibration, scenario) if is_calibrated(scenario) else _no_ranges(tones)
     poses = solve_poses(
         scenario.transmitter_enu_m,
