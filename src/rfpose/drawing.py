@@ -178,9 +178,8 @@ def place_names(
 
     Call it when all else is drawn and limits stand. A name without room is left out.
     """
-    figure = axes.get_figure()
-    assert figure is not None
-    figure.draw_without_rendering()  # type: ignore[union-attr]
+    figure: Any = axes.figure.figure  # the whole, also of axes in a part
+    figure.draw_without_rendering()
     to_points = 72.0 / figure.dpi
     here = to_points * axes.transData.transform(places)
     radius = 5.0

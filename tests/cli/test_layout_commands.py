@@ -268,7 +268,7 @@ def test_ground_by_outline_and_circles(tmp_path):
     ("arguments", "text"),
     [
         (("optimise", SITE, "--pareto", "8..6"), "6..12"),
-        (("optimise", SITE, "--csv", "x.csv"), "go with --pareto"),
+        (("optimise", SITE, "--csv", "x.csv"), "goes with --pareto"),
         (("optimise", SITE, "--pareto", "6..7", "-n", 8), "give -o and -n without it"),
         (("map", SITE, "--tower", 2, 40), "--line-of-sight"),
     ],
@@ -394,3 +394,52 @@ def test_plates_take_the_posture_of_the_field(tmp_path):
         np.testing.assert_allclose(2.0 * (normal @ ray) * normal - ray, to_aim, atol=1e-12)
     np.testing.assert_allclose(stow.plate_rot[:, :, 2], [[0.0, 0.0, 1.0]] * 2, atol=1e-12)
     np.testing.assert_allclose(own.plate_rot[1, :, 2], np.array([0.0, -1.0, 1.0]) / np.sqrt(2.0), atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [9, 11])
+def test_optimise_keeps_what_the_file_says(tmp_path, n):
+    """Names, comments, [mirror], how numbers are written, a scale; only the transmitters are others."""
+    text = SITE.read_text().replace('id = "T3"', 'id = "hill"  # on the hill', 1)
+    text = text.replace('name = "Table 2', 'scale = 0.5  # half of it\nname = "Table 2', 1)
+    text += '\n[[simulation.blocked]]\ntransmitter = "T10"\nreceivers = ["H01"]\n'
+    site, better, picture = (tmp_path / name for name in ("site.toml", "better.toml", "both.svg"))
+    site.write_text(text)
+    options = ("-n", n, "--starts", 1, "--separation", 10, "--sun", 180, 60, "--picture", picture)
+    found = json.loads(run("optimise", site, "-o", better, "--json", *options))
+    now, then = better.read_text(), load_scenario(better)
+    assert "# on the hill" in now
+    assert "# half of it" in now
+    assert "frame_samples = 400_000" in now
+    assert then.transmitter_ids[:4] == ("T1", "T2", "hill", "T4")
+    assert len(then.transmitter) == n
+    assert then.heliostat == load_scenario(site).heliostat
+    assert (len(then.simulation.blocked) == 1) == (n == 11)
+    for each in then.transmitter:  # to a centimetre, and what was found
+        assert each.position_enu_m == pytest.approx(found["transmitters"][each.id], abs=1e-9)
+        assert each.position_enu_m == pytest.approx(np.round(each.position_enu_m, 2), abs=1e-9)
+    assert found["sight_lines_crossed"] == 0
+    assert found["mirror_suns"] == 12
+    assert found["value"] >= 0.999 * found["without_sight_lines"]
+    assert "before: RMS" in picture.read_text()
+
+
+def test_compare_tells_of_each_layout_what_map_does(tmp_path):
+    other, picture, csv_path = tmp_path / "other.toml", tmp_path / "both.svg", tmp_path / "both.csv"
+    site = load_scenario(SITE)
+    higher = site.transmitter_enu_m[:8] + np.array([0.0, 0.0, 5.0])
+    site.with_transmitters(higher).save(other)
+    wanted = ("--estimator", "rigid", "--estimator", "scenario", "--sun", 180, 60)
+    written = ("--picture", picture, "--csv", csv_path, "--cost", 10, 1, 0)
+    found = json.loads(run("compare", SITE, other, *wanted, *written, "--json"))["layouts"]
+    assert [each["name"] for each in found] == [SITE.name, "other.toml"]
+    for each, path in zip(found, (SITE, other), strict=True):
+        mapped = json.loads(run("map", path, *wanted, "--json"))
+        assert each["pdop"] == mapped["pdop"]
+        assert each["normal_mrad"] == mapped["normal_mrad"]
+        lost = mapped["normal_without_transmitter_mrad"]["rigid"]
+        assert each["without_worst_mrad"]["rigid"] == max(lost.values())
+    assert found[0]["cost"] == 100.0 + site.transmitter_enu_m[:, 2].sum()
+    with csv_path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[1]["normal_rigid_rms_mrad"]) == pytest.approx(found[1]["normal_mrad"]["rigid"]["rms"], rel=1e-5)
+    assert "other.toml" in picture.read_text()

@@ -275,9 +275,16 @@ WRITERS = {
     "calibrate-drone": "calibrate --mount m.toml --drone {i} -o {o}",
     "calibrate-picture": "calibrate --mount {i} --drone log.csv --picture {o}",
     "aim": "aim {i} --dish --start 2026-06-21T06:00Z -o {o}",
+    "optimise-picture": "layout optimise {i} --picture {o}",
+    "compare-picture": "layout compare {i} site.toml --picture {o}",
+    "compare-csv": "layout compare {i} site.toml --csv {o}",
+    "track-series.csv": "track {i} -o new.h5 --series {o}",
+    "process-parquet": "process {i} -o new.h5 --parquet {o}",
+    "plot-picture": "plot {i} -o {o}",
     "view": "view {i} --save {o}",
 }
-ENDINGS = {"picture": ".png", "view": ".png", "calibrate": ".toml", "calibrate-drone": ".toml"}
+ENDINGS = {"picture": ".png", "csv": ".csv", "parquet": ".parquet", "view": ".png"}
+ENDINGS |= {"calibrate": ".toml", "calibrate-drone": ".toml"}
 
 
 def _name(writer: str) -> str:

@@ -211,6 +211,8 @@ def test_everything_draws_what_its_command_draws(recording: Recording, result: R
         "3 mirrors": day.plot(),
         "RMS": rf.layout_map(SITE, estimators=["rigid"]).plot(),
         "error budget": rf.budget(SITE, n_draw=0).plot(),
+        "ratio of error to bound": rf.evaluate(result).plot(),
+        "transmitters placed for pdop": rf.optimise(SITE, starts=1).plot(),
     }
     for word, figure in words.items():
         texts = [axes.get_title() for axes in figure.axes] + [figure.get_suptitle()]

@@ -92,6 +92,10 @@ def test_buttons_disturb_the_field(view: LiveView, window: MainWindow, wait: Wai
     assert live.picture.mode == ("emergency", "motors stopped")
     assert not np.linalg.norm(live.picture.instant.spot_m[0]) < 2.0  # NaN: it no longer comes near
     assert np.linalg.norm(live.picture.instant.spot_m[1]) < 2.0
+    # one on its way to stow has no error and no beam; one whose motors stand shines on, and drifts off
+    now = live.picture.instant
+    assert np.isnan([now.error_mrad[0], *now.beam_end_enu_m[0]]).all()
+    assert live.rms_mrad[-1] == pytest.approx(now.error_mrad[1])
     view.normal_button.click()
     after(1)
     assert live.picture.dead == ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,9 @@ from rfpose.scenario import Scenario
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
 from rfpose.truth import Truth
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = [
     "Evaluation",
@@ -218,6 +221,14 @@ class Evaluation(Shown, Tabled):
             [h.id, h.solved, h.failed, *h.normal_error_mrad.as_dict().values(), h.bound_mrad, h.sigma_mrad]
             for h in self.heliostats
         ]
+
+    def plot(self) -> Figure:
+        """Draw error, bound and stated sigma by mirror, RMS over frames; of many mirrors their distribution."""
+        from rfpose.drawing import look
+        from rfpose.pipeline.pictures.results import draw_evaluation
+
+        with look():
+            return draw_evaluation(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return what ``rfpose evaluate --json`` prints; its keys are a contract."""

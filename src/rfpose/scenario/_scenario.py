@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -391,16 +392,14 @@ class Scenario(Record):
         except ScenarioError as error:
             raise ScenarioError(f"{source}{error}") from error
 
-    def with_transmitters(self, transmitters: Sequence[Transmitter] | npt.ArrayLike, *, keep: int = 0) -> Scenario:
+    def with_transmitters(self, transmitters: Sequence[Transmitter] | npt.ArrayLike) -> Scenario:
         """Return the scenario with other transmitters; blockages of those that are gone go with them.
 
         Parameters
         ----------
         transmitters : (transmitter, xyz)
-            Records; or places, site ENU [m]. At places, carriers and amplitudes are the scenario's own while they
-            last; more transmitters share the band evenly anew.
-        keep
-            At places: the first so many keep their names.
+            Records; or places, site ENU [m]. At places, names, carriers and amplitudes are the scenario's own while
+            they last; more transmitters share the band evenly anew.
 
         Raises
         ------
@@ -419,14 +418,15 @@ class Scenario(Record):
         if isinstance(given, Sequence) and given and all(isinstance(one, Transmitter) for one in given):
             new = tuple(given)
         else:
-            new = self._transmitters_at(as_float_array("transmitters", given, ("transmitter", 3)), keep)
+            new = self._transmitters_at(as_float_array("transmitters", given, ("transmitter", 3)))
         left = {one.id for one in new}
         blocked = [one for one in self.simulation.blocked if one.transmitter in left]
         return self.changed(transmitter=new, simulation={"blocked": blocked or None})
 
-    def _transmitters_at(self, place: FloatArray, keep: int) -> tuple[Transmitter, ...]:
-        names = [*self.transmitter_ids[:keep]]
-        names += [f"T{k + 1}" for k in range(len(place)) if f"T{k + 1}" not in names][: len(place) - keep]
+    def _transmitters_at(self, place: FloatArray) -> tuple[Transmitter, ...]:
+        names = [*self.transmitter_ids[: len(place)]]
+        unused = (name for name in (f"T{k + 1}" for k in itertools.count()) if name not in names)
+        names += list(itertools.islice(unused, len(place) - len(names)))
         radio = self.radio
         if len(place) <= len(self.transmitter):
             carrier = self.carrier_hz[: len(place)]
@@ -435,6 +435,8 @@ class Scenario(Record):
             margin = radio.clock_search_ppm * 1e-6 * (radio.centre_frequency_hz + half)
             usable = half - margin - float(self.tone_hz.max())
             carrier = np.linspace(-1.0, 1.0, len(place)) * usable * len(place) / (len(place) + 1.0)
+            # in round numbers, a thousandth of what lies between two
+            carrier = np.round(carrier, -int(np.floor(np.log10(2e-3 * usable / len(place)))))
         amplitude = [*(t.amplitude for t in self.transmitter), *np.ones(len(place))]
         return tuple(
             Transmitter(id=name, position_enu_m=tuple(map(float, p)), carrier_hz=float(f), amplitude=float(a))

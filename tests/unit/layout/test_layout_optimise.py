@@ -8,6 +8,7 @@ from rfpose.layout.maps import check_site, disc_points, mirrors_facing
 from rfpose.layout.optimise import (
     Constraints,
     Costs,
+    Sightlines,
     Zone,
     efficient,
     evaluate_placement,
@@ -177,3 +178,39 @@ def test_exchange_begins_with_the_best_that_meets_the_rules():
     assert found.start_value[1] == measured(well_off, good, "rms")
     with pytest.raises(InvalidInputError, match="tries"):
         exchange(begin, well_off, FIELD, DISC, criterion="near", tries=1)
+
+
+AIM = np.array([0.0, 0.0, 0.5])
+PIVOTS = np.array([[0.8, 0.0, 0.02], [0.0, 0.6, 0.02], [-0.5, -0.5, 0.02]])
+SIGHT = Sightlines(start_enu_m=PIVOTS, end_enu_m=np.broadcast_to(AIM, (3, 3)), clearance_m=0.05)
+
+
+def test_tower_is_clear_of_a_line_beside_it_or_below() -> None:
+    tower = np.array([[0.4, 0.0, 0.2], [0.4, 0.0, 0.3], [0.4, 0.12, 0.3], [0.0, 0.0, 0.5], [1.2, 0.0, 0.4]])
+    # the first line passes x = 0.4 at a height of 0.26; where it ends stands the receiver's own tower
+    margin, _ = SIGHT.margin(tower)
+    assert margin == pytest.approx([0.01, -0.04 - 0.01, 0.07, 0.0, 0.35])
+    assert [SIGHT.crossed(each[None]) for each in tower] == [0, 1, 0, 0, 0]
+    assert SIGHT.crossed(np.vstack([tower, [[0.0, 0.3, 0.45]]])) == 2
+
+
+def test_slope_of_clearance_is_that_of_differences() -> None:
+    rng = np.random.default_rng(5)
+    tower = np.column_stack([rng.uniform(-1.0, 1.0, (200, 2)), rng.uniform(0.05, 0.5, 200)])
+    margin, slope = SIGHT.margin(tower)
+    step = 1e-7 * rng.normal(size=(200, 3))
+    change = SIGHT.margin(tower + step)[0] - margin
+    # but for the few that lie on an edge, where another line becomes the worst
+    assert np.mean(np.abs(change - (slope * step).sum(axis=1)) < 1e-3 * 1e-7) > 0.98
+
+
+def test_search_keeps_new_towers_out_of_lines_of_sight() -> None:
+    bare = optimise(7, FIELD, DISC, starts=2, seed=3)
+    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    ring = np.column_stack([0.95 * np.cos(angle), 0.95 * np.sin(angle), np.full(12, 0.02)])
+    sight = Sightlines(start_enu_m=ring, end_enu_m=np.broadcast_to(AIM, ring.shape), clearance_m=0.06)
+    rules = Constraints(allowed=DISC.allowed, height_m=DISC.height_m, sight=sight)
+    kept = optimise(7, FIELD, rules, starts=2, seed=3)
+    assert sight.crossed(bare.transmitter_enu_m) > 0
+    assert sight.margin(kept.transmitter_enu_m)[0].min() > -1e-5
+    assert kept.value >= bare.value * 0.999

@@ -8,7 +8,13 @@ import click
 
 __all__ = ["command"]
 
-_COMMANDS = {"map": "map_command", "optimise": "optimise_command", "budget": "budget_command", "tones": "tones_command"}
+_COMMANDS = {
+    "map": "map_command",
+    "optimise": "optimise_command",
+    "compare": "compare_command",
+    "budget": "budget_command",
+    "tones": "tones_command",
+}
 
 
 class _Studies(click.Group):

@@ -66,7 +66,7 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("-n", "--transmitters", type=click.IntRange(min=1), help="How many; default: as many as there are.")
 @click.option("--pareto", type=_Counts(), metavar="N1..N2", help="Instead, the best of each number: cost and accuracy.")
 @click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="With --pareto: one row a number.")
-@click.option("--picture", type=click.Path(path_type=Path), help="With --pareto: PNG or SVG.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Before and after, or the curve: PNG, SVG or PDF.")
 @click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True,
               help="PDOP, or the normal's bound; `site`: what pose `site` states among reflections.")  # fmt: skip
 @click.option("--statistic", default="rms", show_default=True, help="rms, worst, or a percentile such as p95.")
@@ -87,6 +87,12 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
     help="Between towers [m]; default: radius/20.",
 )
 @click.option("--clearance", "clearance_m", type=float, default=0.0, show_default=True, help="To heliostats [m].")
+@click.option(
+    "--sight",
+    "sight_m",
+    type=float,
+    help="From lines of sight to the aim point [m]; 0: may stand in them; default: half a mirror and half a metre.",
+)
 @click.option("--keep", type=click.IntRange(min=0), default=0, show_default=True, help="The first so many stay.")
 @click.option("--cost", type=(float, float, float), default=(1.0, 0.0, 0.0), metavar="TOWER HEIGHT CABLE",
               help="Cost of a tower, of a metre of height, of a metre of cable.")  # fmt: skip
@@ -119,9 +125,9 @@ def command(
     """Place the transmitters anew, for the best accuracy that the limits allow."""
     if pareto is not None and (output is not None or transmitters is not None):
         raise click.UsageError("--pareto compares numbers of transmitters; give -o and -n without it")
-    if pareto is None and (csv_path is not None or picture is not None):
-        raise click.UsageError("--csv and --picture go with --pareto")
-    check_ending(picture, ".png", ".svg")
+    if pareto is None and csv_path is not None:
+        raise click.UsageError("--csv goes with --pareto")
+    check_ending(picture, ".png", ".svg", ".pdf")
     claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline_csv"]], force=force)
     with claimed:
         check_scenario(scenario)
@@ -140,11 +146,11 @@ def command(
         if pareto is not None:
             curve = _compare(scenario, pareto, settings, csv_path, picture)
         else:
-            found = _place(scenario, transmitters, settings, output)
+            found = _place(scenario, transmitters, settings, output, picture)
     if pareto is not None:
         _show_curve(curve.as_dict(), csv_path, picture)
     else:
-        _show_places(found.as_dict(), output)
+        _show_places(found.as_dict(), output, picture)
 
 
 def _rules(
@@ -155,6 +161,7 @@ def _rules(
     height_m: tuple[float, float] | None,
     separation_m: float | None,
     clearance_m: float,
+    sight_m: float | None,
     keep: int,
 ) -> Rules:
     from rfpose.pipeline.layout import Rules
@@ -167,30 +174,55 @@ def _rules(
         height_m=height_m,
         separation_m=separation_m,
         clearance_m=clearance_m,
+        sight_m=sight_m,
         keep=keep,
     )
 
 
-def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None) -> SitePlacement:
+def _place(
+    scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None, picture: Path | None
+) -> SitePlacement:
+    from rfpose.drawing import look, save_figure
+
     with progress("Searching") as on_progress:
         found = rfpose.optimise(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
     if output is not None:
         found.save(output)
+    if picture is not None:
+        with look():
+            save_figure(found.plot(), picture)
     return found
 
 
-def _show_places(summary: dict[str, Any], output: Path | None) -> None:
+def _show_places(summary: dict[str, Any], output: Path | None, picture: Path | None) -> None:
     """Print where the transmitters should stand."""
     if wants_json():
-        emit_json({**summary, "output": output})
+        emit_json({**summary, "output": output, "picture": picture})
         return
     unit = f" {summary['unit']}".rstrip()
     name = f"{summary['criterion']} {summary['statistic']}"
     say(f"{name}: {summary['value']:.4g}{unit}, was {summary['before']:.4g}{unit}")
     say(f"without its most needed transmitter: {summary['without_worst']:.4g}{unit}; cost {summary['cost']:g}")
     say(f"PDOP rms: {summary['pdop_rms']:.4g}, was {summary['pdop_rms_before']:.4g}")
+    _say_light(summary, unit)
     places = [[name, *(f"{x:.3f}" for x in place)] for name, place in summary["transmitters"].items()]
     table("Transmitters [m]", ["", "east", "north", "up"], places)
+
+
+def _say_light(summary: dict[str, Any], unit: str) -> None:
+    """Say what towers do to mirrors' light, and what keeping them out of it costs."""
+    if summary["sight_lines_crossed"] is not None:
+        say(
+            f"lines of sight to the aim point with a tower in their way: {summary['sight_lines_crossed']}, were "
+            f"{summary['sight_lines_crossed_before']}"
+        )
+    if summary["without_sight_lines"] is not None:
+        say(f"were towers allowed there: {summary['without_sight_lines']:.4g}{unit}")
+    if summary["mirror_suns"]:
+        say(
+            f"mirrors behind a tower, over all suns studied: {summary['mirror_suns_shaded']} of "
+            f"{summary['mirror_suns']}, were {summary['mirror_suns_shaded_before']}"
+        )
 
 
 def _compare(

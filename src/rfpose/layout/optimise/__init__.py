@@ -1,7 +1,7 @@
 """Where to put transmitters: what is allowed, what it costs, and the search."""
 
 from rfpose.layout.optimise.exchange import Measure, exchange, measured
-from rfpose.layout.optimise.rules import Constraints, Costs, Zone
+from rfpose.layout.optimise.rules import Constraints, Costs, Sightlines, Zone
 from rfpose.layout.optimise.search import (
     CRITERIA,
     Criterion,
@@ -20,6 +20,7 @@ __all__ = [
     "Measure",
     "Placement",
     "Progress",
+    "Sightlines",
     "Zone",
     "efficient",
     "evaluate_placement",

@@ -138,7 +138,7 @@ def _other_places(
     step = near * problem.scale * rng.standard_normal((4 * tries, 3)) * [1.0, 1.0, 0.5]
     close = site[tower] + step
     close[:, 2] = np.clip(close[:, 2], low, high)
-    free = problem.is_free(close[:, :2], others[:, :2])
+    free = problem.is_free(close, others[:, :2])
     return np.concatenate([anywhere, close[free][: tries - tries // 2]])
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Constraints", "Costs", "Zone"]
+__all__ = ["Constraints", "Costs", "Sightlines", "Zone"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +66,63 @@ class Zone:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Sightlines:
+    """Lines from mirrors to where their light goes, which towers stay out of: beside them, or below.
+
+    A tower is an upright line from the ground to its antenna. The last ``clearance_m`` of a line before its end, where
+    the receiver's own tower stands, does not count.
+
+    Attributes
+    ----------
+    start_enu_m, end_enu_m : (line, xyz)
+        [m].
+    clearance_m
+        Least distance: sideways, or of the antenna below the line [m].
+    """
+
+    start_enu_m: FloatArray
+    end_enu_m: FloatArray
+    clearance_m: float
+
+    def _clear(self, tower_enu_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return distances sideways and below (tower, line), the way along (tower, line), the gap (tower, line, xy)."""
+        along = self.end_enu_m - self.start_enu_m
+        length = np.maximum(np.linalg.norm(along[:, :2], axis=1), 1e-9)
+        offset = tower_enu_m[:, None, :2] - self.start_enu_m[:, :2]
+        reach = np.maximum(1.0 - self.clearance_m / length, 0.0)
+        part = np.clip(np.einsum("tlx,lx->tl", offset, along[:, :2]) / length**2, 0.0, reach)
+        gap = offset - part[..., None] * along[:, :2]
+        above = self.start_enu_m[:, 2] + part * along[:, 2] - tower_enu_m[:, None, 2]
+        return np.linalg.norm(gap, axis=2), above, np.where((part > 0.0) & (part < reach), part, np.nan), gap
+
+    def margin(self, tower_enu_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return by how much each tower (tower, xyz) is clear of the worst line [m], and its slope (tower, xyz).
+
+        Negative: it stands in the way.
+        """
+        aside, above, part, gap = self._clear(tower_enu_m)
+        clear = np.maximum(aside, above) - self.clearance_m
+        rows, worst = np.arange(len(tower_enu_m)), np.argmin(clear, axis=1)
+        along = (self.end_enu_m - self.start_enu_m)[worst]
+        beside = (aside >= above)[rows, worst][:, None]
+        flat = gap[rows, worst] / np.maximum(aside[rows, worst], 1e-12)[:, None]
+        # where the tower is nearest to an end of the line, its height does not change with the place
+        steep = along[:, 2] / np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-18)
+        rise = np.where(np.isfinite(part[rows, worst]), steep, 0.0)[:, None] * along[:, :2]
+        slope = np.column_stack([np.where(beside, flat, rise), np.where(beside[:, 0], 0.0, -1.0)])
+        return clear[rows, worst], slope
+
+    def crossed(self, tower_enu_m: FloatArray) -> int:
+        """Return how many of the lines have a tower in their way."""
+        aside, above, _, _ = self._clear(tower_enu_m)
+        return int((np.maximum(aside, above) < self.clearance_m - _TOUCH_M).any(axis=0).sum())
+
+
+_TOUCH_M = 1e-3
+"""A tower that stands in a line by less only touches it; places are written in round numbers."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Constraints:
     """Where transmitters may stand.
 
@@ -81,6 +138,8 @@ class Constraints:
         Least horizontal distance between two towers [m].
     clearance_m
         Least horizontal distance to a heliostat [m].
+    sight
+        Lines that new towers stay out of; None: none.
     """
 
     allowed: tuple[Zone, ...]
@@ -88,6 +147,7 @@ class Constraints:
     excluded: tuple[Zone, ...] = ()
     separation_m: float = 0.0
     clearance_m: float = 0.0
+    sight: Sightlines | None = None
 
     def __post_init__(self) -> None:
         low, high = self.height_m

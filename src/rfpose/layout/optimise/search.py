@@ -101,14 +101,17 @@ class _Problem:
         gradient = np.einsum("p,pta->ta", weight, slope)[len(self.existing) :]
         return float(np.log(value)), self.scale * gradient.ravel() / value
 
-    def is_free(self, ground: FloatArray, others: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which places (place, xy) a tower may take beside others (tower, xy)."""
-        rules = self.constraints
+    def is_free(self, place: FloatArray, others: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return which places (place, xyz) a tower may take beside others (tower, xy)."""
+        rules, ground = self.constraints, place[:, :2]
         free: npt.NDArray[np.bool_] = np.any([zone.depth(ground)[0] >= 0.0 for zone in rules.allowed], axis=0)
         for zone in rules.excluded:
             free &= zone.depth(ground)[0] <= 0.0
         if self.heliostats is not None:
             free &= np.asarray(self.heliostats.query(ground)[0]) >= rules.clearance_m
+        if rules.sight is not None:
+            found = np.flatnonzero(free)
+            free[found] = rules.sight.margin(place[found])[0] >= 0.0
         for other in others if rules.separation_m > 0.0 else ():
             free &= np.hypot(*(ground - other).T) >= rules.separation_m
         return free
@@ -147,6 +150,12 @@ class _Problem:
             distance, nearest = (np.asarray(a) for a in self.heliostats.query(ground))
             offset = ground - self.heliostats.data[nearest]
             each(distance - rules.clearance_m, offset / np.maximum(distance, 1e-12)[:, None])
+        if rules.sight is not None:
+            depth, by = rules.sight.margin(self.scale * new)
+            rows = np.zeros((n, n, 3))
+            rows[np.arange(n), np.arange(n)] = by
+            value.append(depth / self.scale)
+            slope.append(rows.reshape(n, -1))
         if rules.separation_m > 0.0:
             others = np.vstack([ground, self.existing[:, :2]])
             i, j = np.triu_indices(len(others), 1)
@@ -354,17 +363,18 @@ def _draw(problem: _Problem, n_new: int, rng: np.random.Generator) -> FloatArray
         while len(placed) < n_new:
             which = rng.choice(len(boxes), size=_DRAWS, p=area / area.sum())
             ground = rng.uniform(boxes[which, 0], boxes[which, 1])
-            height = rng.uniform(*rules.height_m, size=_DRAWS)
-            free = np.flatnonzero(problem.is_free(ground, np.vstack([problem.existing, placed])[:, :2]))
+            place = np.column_stack([ground, rng.uniform(*rules.height_m, size=_DRAWS)])
+            free = np.flatnonzero(problem.is_free(place, np.vstack([problem.existing, placed])[:, :2]))
             if not free.size:
                 break
-            placed = np.vstack([placed, np.append(ground[free[0]], height[free[0]])])
+            placed = np.vstack([placed, place[free[0]]])
         if len(placed) == n_new:
             return placed
         most = max(most, len(placed))
     raise GeometryError(
         f"the constraints leave no room for {n_new} new transmitters ({most} found places); relax the "
-        f"separation of {rules.separation_m:g} m, the clearance, or the zones"
+        f"separation of {rules.separation_m:g} m, the clearance, {'the lines of sight, ' if rules.sight else ''}or the "
+        "zones"
     )
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.drawing import new_figure
+from rfpose.drawing import BLUE, VERMILION, WIDTH_INCH, angle_unit, blank_figure, new_figure
 from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.files import write_atomically
 from rfpose.layout import maps
 from rfpose.layout import optimise as search
 from rfpose.layout.maps import Mirrors
@@ -20,14 +21,28 @@ from rfpose.layout.optimise import (
     Costs,
     Criterion,
     Placement,
+    Sightlines,
     Zone,
     evaluate_placement,
 )
 from rfpose.measurement import noise_of
 from rfpose.multilat.normal import MAX_SIGMA_RAD
-from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.layout.mapping import layout_map
+from rfpose.pipeline.layout.site import (
+    Field,
+    Posture,
+    Postures,
+    Site,
+    Sun,
+    load_site,
+    postures_of,
+    stacked,
+    suns_of,
+)
+from rfpose.pipeline.layout.text import edited
+from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
 from rfpose.pipeline.site import check_site_solvable, forecast_normals
-from rfpose.scenario import PositionForm, Scenario, naming, read_positions
+from rfpose.scenario import Heliostat, PositionForm, Scenario, naming, read_positions
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
 
@@ -61,6 +76,9 @@ class Rules:
         Between towers; default: a twentieth of the radius, since a rigid mirror's optimum would stack them.
     clearance_m
         To heliostats.
+    sight_m
+        From the lines of sight of mirrors to the aim point, beside or below; 0: towers may stand in them. Default: half
+        the diagonal of the largest mirror and half a metre for the mast.
     keep
         The scenario's first so many transmitters stay where they are.
     """
@@ -72,13 +90,16 @@ class Rules:
     excluded_m: Sequence[tuple[float, float, float]] = ()
     separation_m: float | None = None
     clearance_m: float = 0.0
+    sight_m: float | None = None
     keep: int = 0
 
-    def constraints(self, transmitter_enu_m: FloatArray) -> Constraints:
-        """Return the rules with defaults taken from the transmitters as they stand."""
+    def constraints(self, scenario: Scenario) -> Constraints:
+        """Return the rules with defaults taken from the scenario as it is."""
+        transmitter_enu_m = scenario.transmitter_enu_m
         own_radius = float(np.hypot(transmitter_enu_m[:, 0], transmitter_enu_m[:, 1]).max())
         radius = own_radius if self.radius_m is None else self.radius_m
-        for name, value in (("radius_m", self.radius_m), ("separation_m", self.separation_m)):
+        for name in ("radius_m", "separation_m", "sight_m"):
+            value = getattr(self, name)
             if value is not None and not 0.0 <= value < np.inf:
                 raise InvalidInputError(f"`{name}` must be a number of metres, not negative, got {value}")
         if not 0.0 <= self.clearance_m < np.inf:
@@ -97,18 +118,93 @@ class Rules:
             excluded=tuple(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.excluded_m),
             separation_m=_SEPARATION * radius if self.separation_m is None else self.separation_m,
             clearance_m=self.clearance_m,
+            sight=sightlines(scenario, self.sight_m),
         )
+
+
+_MAST_M = 0.5
+"""What a mast needs beside a mirror's light."""
+
+
+def sightlines(scenario: Scenario, clearance_m: float | None = None) -> Sightlines | None:
+    """Return the lines from mirrors to the aim point; None without one, or with no clearance."""
+    aim = scenario.site.aim_enu_m
+    if aim is None or clearance_m == 0.0:
+        return None
+    pivot = scenario.pivot_enu_m
+    if clearance_m is None:
+        clearance_m = _MAST_M + max(_half_m(mirror) for mirror in scenario.heliostat)
+    return Sightlines(start_enu_m=pivot, end_enu_m=np.broadcast_to(aim, pivot.shape), clearance_m=clearance_m)
+
+
+def _half_m(mirror: Heliostat) -> float:
+    """Return how far a mirror reaches from its middle: by its outline, else by its receivers [m]."""
+    if mirror.width_m is not None and mirror.height_m is not None:
+        return 0.5 * float(np.hypot(mirror.width_m, mirror.height_m))
+    return float(np.linalg.norm(np.asarray(mirror.receiver_mirror_m), axis=1).max())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """What towers do to mirrors' light.
+
+    Attributes
+    ----------
+    crossed
+        Lines of sight, of so many mirrors, with a tower in their way; None without an aim point.
+    shaded
+        Mirrors and suns of the postures with a tower between them, of ``mirror_suns``.
+    """
+
+    crossed: int | None
+    shaded: int
+    mirror_suns: int
+
+
+_SHADE_M = 1000.0
+
+
+def _standing(scenario: Scenario, suns: Sequence[FloatArray]) -> Standing:
+    lines, tower, pivot = sightlines(scenario), scenario.transmitter_enu_m, scenario.pivot_enu_m
+    half = _MAST_M + max(_half_m(mirror) for mirror in scenario.heliostat)
+    shaded = 0
+    for sun in suns:
+        way = Sightlines(start_enu_m=pivot, end_enu_m=pivot + _SHADE_M * sun, clearance_m=half)
+        shaded += way.crossed(tower)
+    crossed = None if lines is None else lines.crossed(tower)
+    return Standing(crossed=crossed, shaded=shaded, mirror_suns=len(suns) * len(pivot))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SitePlacement(Shown):
-    """Transmitters placed anew: the placement, the scenario with it, and what it was before."""
+    """Transmitters placed anew: the placement, the scenario with it, and what it was before.
+
+    Attributes
+    ----------
+    placement, scenario
+        After; places in round numbers.
+    source
+        The scenario's file, whose text `save` changes; None: there is none, or its field was replaced.
+    site
+        Before.
+    before, before_pdop, after_pdop
+        What was minimised, and PDOP.
+    without_sight
+        What was minimised, had towers been allowed in lines of sight; None where they were, or there are none.
+    standing_before, standing
+        What towers do to mirrors' light.
+    """
 
     placement: Placement
     scenario: Scenario
+    source: Path | None
+    site: Scenario
     before: float
     before_pdop: float
     after_pdop: float
+    without_sight: float | None
+    standing_before: Standing
+    standing: Standing
 
     def as_dict(self) -> dict[str, Any]:
         """Return the placement with stable keys; angles in mrad of the normal."""
@@ -123,6 +219,12 @@ class SitePlacement(Shown):
             "without_worst": factor * found.lost_one,
             "pdop_rms": self.after_pdop,
             "pdop_rms_before": self.before_pdop,
+            "without_sight_lines": None if self.without_sight is None else factor * self.without_sight,
+            "sight_lines_crossed": self.standing.crossed,
+            "sight_lines_crossed_before": self.standing_before.crossed,
+            "mirror_suns": self.standing.mirror_suns,
+            "mirror_suns_shaded": self.standing.shaded,
+            "mirror_suns_shaded_before": self.standing_before.shaded,
             "cost": found.cost,
             "searches": len(found.start_value),
             "searches_failed": int(np.isnan(found.start_value).sum()),
@@ -141,8 +243,21 @@ class SitePlacement(Shown):
         return ["transmitter", "east [m]", "north [m]", "up [m]"], rows
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
-        """Write the scenario with the new places; see `Scenario.save`."""
-        self.scenario.save(path, force=force)
+        """Write the scenario with the new places: its file's text with comments and all, else see `Scenario.save`.
+
+        Raises
+        ------
+        RecordingError
+            The file exists, or cannot be written.
+        """
+        if self.source is None:
+            self.scenario.save(path, force=force)
+        else:
+            write_atomically(path, edited(self.source, self.scenario).encode(), force=force)
+
+    def plot(self) -> Figure:
+        """Draw the field before and after, each mirror in the colour of its PDOP or of its normal's bound."""
+        return _before_and_after(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -209,6 +324,7 @@ class _Task:
     postures: tuple[Posture, ...]
     field: Mirrors
     constraints: Constraints
+    suns: tuple[FloatArray, ...]
     keep: int
     criterion: str
     statistic: str
@@ -257,7 +373,7 @@ class _Task:
 
     def site_variance(self, transmitter_enu_m: FloatArray) -> FloatArray:
         """(posture × heliostat,) what pose ``site`` would state [rad²]; of a mirror it cannot solve, the most."""
-        moved = self.scenario.with_transmitters(transmitter_enu_m, keep=self.keep)
+        moved = self.scenario.with_transmitters(transmitter_enu_m)
         sigma = [
             forecast_normals(moved, np.concatenate([p.mirrors.rot_enu_from_mirror, p.plate_rot])).sigma_rad
             for p in self.postures
@@ -292,8 +408,8 @@ def _task(
             check_site_solvable(scenario)
     return _Task(
         scenario=scenario, postures=studied, field=stacked([p.mirrors for p in studied]),
-        constraints=chosen.constraints(now), keep=chosen.keep, criterion=criterion, statistic=statistic, costs=costs,
-        starts=starts, seed=seed,
+        constraints=chosen.constraints(scenario), suns=tuple(suns_of(scenario, postures)), keep=chosen.keep,
+        criterion=criterion, statistic=statistic, costs=costs, starts=starts, seed=seed,
     )  # fmt: skip
 
 
@@ -350,17 +466,44 @@ def optimise(
         criterion=criterion, statistic=statistic, costs=costs, starts=starts, seed=seed,
     )  # fmt: skip
     now = task.scenario.transmitter_enu_m
+    step_m, sight = _step_m(now), task.constraints.sight
+    n, tell = n_transmitter or len(now), on_progress or (lambda _done, _total: None)
+    twice = sight is not None and criterion != SITE  # which would take too long
+    if sight is not None:  # still clear of it when places are rounded
+        wide = replace(sight, clearance_m=sight.clearance_m + step_m)
+        task = replace(task, constraints=replace(task.constraints, sight=wide))
     with naming(scenario):
-        found = task.place(n_transmitter or len(now), on_progress)
-        better = task.scenario.with_transmitters(maps.check_site(found.transmitter_enu_m), keep=task.keep)
-        before = task.value(now)
+        found = task.place(n, lambda k, total: tell(k, (1 + twice) * total))
+        without = None
+        if twice:
+            free = replace(task, constraints=replace(task.constraints, sight=None))
+            without = free.place(n, lambda k, total: tell(total + k, 2 * total)).value
+        new = step_m * np.round(found.transmitter_enu_m[task.keep :] / step_m)
+        places = np.vstack([now[: task.keep], new])
+        better = task.scenario.with_transmitters(maps.check_site(places))
+        before, value = task.value(now), task.value(places)
     return SitePlacement(
-        placement=found,
+        placement=replace(found, transmitter_enu_m=places, value=value),
         scenario=better,
+        source=Path(scenario) if field is None and not isinstance(scenario, Scenario) else None,
+        site=task.scenario,
         before=before,
         before_pdop=evaluate_placement(now, task.field),
-        after_pdop=evaluate_placement(found.transmitter_enu_m, task.field),
+        after_pdop=evaluate_placement(places, task.field),
+        without_sight=without,
+        standing_before=_standing(task.scenario, task.suns),
+        standing=_standing(better, task.suns),
     )
+
+
+_ROUND = 1e-4
+"""Places are written to so much of the site's size."""
+
+
+def _step_m(transmitter_enu_m: FloatArray) -> float:
+    """Return to what places are rounded, so that one can peg them out: a centimetre on a site of 100 m."""
+    size = max(float(np.ptp(transmitter_enu_m[:, :2], axis=0).max()), 1e-9)
+    return float(10.0 ** np.round(np.log10(_ROUND * size)))
 
 
 def pareto(
@@ -415,9 +558,9 @@ def _drawn(curve: SitePlacements) -> Figure:
     rows = summary["placements"]
     count = [row["transmitters"] for row in rows]
     figure, axes = new_figure(8.0, 5.4)
-    axes.plot(count, [row["value"] for row in rows], "o-", color="#0072B2", label="all transmitters")
+    axes.plot(count, [row["value"] for row in rows], "o-", color=BLUE, label="all transmitters")
     lost = np.array([row["without_worst"] for row in rows], np.float64)
-    axes.plot(count, np.where(np.isfinite(lost), lost, np.nan), "s--", color="#D55E00", label="the worst one lost")
+    axes.plot(count, np.where(np.isfinite(lost), lost, np.nan), "s--", color=VERMILION, label="the worst one lost")
     beaten = [k for k, row in enumerate(rows) if not row["efficient"]]
     if beaten:
         axes.plot([count[k] for k in beaten], [rows[k]["value"] for k in beaten], "x", color="k", ms=9, label="beaten")
@@ -434,3 +577,30 @@ def _drawn(curve: SitePlacements) -> Figure:
     axes.legend()
     axes.set_title(f"{curve.scenario.name}: accuracy against number of transmitters")
     return figure
+
+
+def _before_and_after(found: SitePlacement) -> Figure:
+    shown = [layout_map(site, estimators=[_estimator(found)]) for site in (found.site, found.scenario)]
+    is_dop = found.placement.criterion == "pdop"
+    values = [each.pdop if is_dop else each.rms_mrad[_estimator(found)] for each in shown]
+    factor, unit = (1.0, "") if is_dop else angle_unit(np.concatenate(values))
+    label = "PDOP" if is_dop else f"bound of the normal, {_estimator(found)} [{unit}]"
+    known = np.concatenate(values)
+    limits = (0.0, factor * float(np.nanmax(known)) if np.isfinite(known).any() else 1.0)
+    figure = blank_figure(WIDTH_INCH, 4.3)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for axes, site, value, name in zip(panels, (found.site, found.scenario), values, ("before", "after"), strict=True):
+        dots = draw_mirrors(axes, site.pivot_enu_m, factor * value, limits=limits)
+        draw_site(axes, site)
+        rms = factor * float(np.sqrt(np.nanmean(value**2)))
+        axes.set_title(f"{name}: RMS {rms:.3g} {unit}".rstrip(), fontsize=9)
+    figure.colorbar(dots, ax=list(panels), label=label, shrink=0.8)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.suptitle(f"{found.scenario.name}: transmitters placed for {found.placement.criterion}", fontsize=10)
+    for axes, site in zip(panels, (found.site, found.scenario), strict=True):
+        finish_plan(axes, site, site.pivot_enu_m)
+    return figure
+
+
+def _estimator(found: SitePlacement) -> str:
+    return "rigid" if found.placement.criterion == "pdop" else found.placement.criterion

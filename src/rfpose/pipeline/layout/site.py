@@ -27,7 +27,7 @@ from rfpose.scenario import Scenario, naming, scenario_of
 from rfpose.sun import Site as SunSite
 from rfpose.sun import sun_position
 
-__all__ = ["Field", "Posture", "Postures", "Sight", "Site", "Sun", "load_site", "postures_of", "stacked"]
+__all__ = ["Field", "Posture", "Postures", "Sight", "Site", "Sun", "load_site", "postures_of", "stacked", "suns_of"]
 
 Site = Scenario | str | Path
 """A scenario, or the file of one."""
@@ -111,6 +111,18 @@ def load_site(site: Site, field: Field = None) -> Scenario:
         check_unambiguous(maps.check_site(scenario.mast_enu_m), scenario.wavelength_m)
         maps.check_clear(scenario)
     return scenario
+
+
+def suns_of(scenario: Scenario, wanted: Postures) -> list[FloatArray]:
+    """Return directions of the suns of the postures to study (xyz); without any the simulated one, if there is one."""
+    suns = list(wanted.suns_deg)
+    if wanted.day is not None:
+        suns += [sun for _, sun in _suns_of_day(scenario, wanted.day, _DAY_STEP_MIN)]
+    if wanted.year is not None:
+        for month in range(1, 13):
+            suns += [sun for _, sun in _suns_of_day(scenario, date(wanted.year, month, 21), _YEAR_STEP_MIN)]
+    simulated = scenario.simulated_sun_enu
+    return [_direction(sun) for sun in suns] or ([] if simulated is None else [simulated])
 
 
 def postures_of(scenario: Scenario, wanted: Postures) -> list[Posture]:

@@ -37,7 +37,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "Colour", "draw_errors", "draw_field_map", "draw_links", "draw_mirror", "frame_title"]
+__all__ = [
+    "COLOURS",
+    "Colour",
+    "draw_errors",
+    "draw_evaluation",
+    "draw_field_map",
+    "draw_links",
+    "draw_mirror",
+    "frame_title",
+]
 
 Colour = Literal["error", "sigma", "protection", "transmitters"]
 COLOURS = {
@@ -170,16 +179,25 @@ class _Curve:
     marker: str
 
 
+_STATED = "sigma that the result states"
+
+
+def _compared(evaluation: Evaluation) -> list[_Curve]:
+    error, bound = 1e3 * evaluation.normal_error_rad, 1e3 * evaluation.bound_rad
+    return [
+        _Curve(label="error against the truth", mrad=error, colour=BLUE, marker="o"),
+        _Curve(label="bound of this estimator", mrad=bound, colour=PINK, marker="d"),
+    ]
+
+
 def _curves(result: Result, evaluation: Evaluation | None) -> list[_Curve]:
     sigma = np.where(result.poses.status == PoseStatus.OK, 1e3 * result.poses.sigma_rad, np.nan)
-    found = [_Curve(label="sigma that the result states", mrad=sigma, colour=VERMILION, marker="|")]
+    found = [_Curve(label=_STATED, mrad=sigma, colour=VERMILION, marker="|")]
     if result.integrity is not None:
         level = 1e3 * result.integrity.protection_level_rad
         found.append(_Curve(label="protection level", mrad=level, colour=GREEN, marker=">"))
     if evaluation is not None:
-        error, bound = 1e3 * evaluation.normal_error_rad, 1e3 * evaluation.bound_rad
-        found.insert(0, _Curve(label="error against the truth", mrad=error, colour=BLUE, marker="o"))
-        found.insert(1, _Curve(label="bound of this estimator", mrad=bound, colour=PINK, marker="d"))
+        found = [*_compared(evaluation), *found]
     found = [each for each in found if (np.isfinite(each.mrad) & (each.mrad > 0.0)).any()]
     if not found:
         raise InvalidInputError("no mirror was solved: there is nothing to draw")
@@ -193,35 +211,56 @@ def draw_errors(result: Result, *, evaluation: Evaluation | None = None) -> Figu
     """
     curves = _curves(result, evaluation)
     ids, n_frame = result.scenario.heliostat_ids, len(result.frame_start_index)
-    factor, unit = angle_unit(np.concatenate([_rms(c.mrad) for c in curves]))
-    tall = 2.8 if len(ids) > MANY else float(np.clip(0.8 + 0.17 * len(ids), 1.8, 9.0))
+    tall = _tall(len(ids))
     rows = [tall, 2.2] if n_frame > 1 else [tall]
     figure = blank_figure(WIDTH_INCH, sum(rows) + 0.9)
     panels = np.atleast_1d(np.asarray(figure.subplots(len(rows), 1, height_ratios=rows)))
-    by_mirror = panels[0]
+    _by_mirror(panels[0], ids, curves, n_frame)
+    if n_frame > 1:
+        _over_frames(panels[1], result, curves)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.suptitle(f"{result.scenario.name}: how good the normals are", fontsize=10)
+    return figure
+
+
+def draw_evaluation(evaluation: Evaluation) -> Figure:
+    """Draw error, bound and stated sigma by mirror, RMS over frames; of many mirrors their distribution."""
+    ids = tuple(row.id for row in evaluation.heliostats)
+    sigma = np.array([[row.sigma_mrad for row in evaluation.heliostats]])
+    curves = [*_compared(evaluation), _Curve(label=_STATED, mrad=sigma, colour=VERMILION, marker="|")]
+    curves = [each for each in curves if (np.isfinite(each.mrad) & (each.mrad > 0.0)).any()]
+    if not curves:
+        raise InvalidInputError("no mirror was solved: there is nothing to draw")
+    figure, axes = new_figure(WIDTH_INCH, _tall(len(ids)) + 0.9)
+    _by_mirror(axes, ids, curves, len(evaluation.normal_error_rad))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    axes.set_title(f"ratio of error to bound {evaluation.ratio_to_bound:.3f} ± {evaluation.ratio_sigma:.2g}")
+    return figure
+
+
+def _tall(n_mirror: int) -> float:
+    return 2.8 if n_mirror > MANY else float(np.clip(0.8 + 0.17 * n_mirror, 1.8, 9.0))
+
+
+def _by_mirror(axes: Axes, ids: tuple[str, ...], curves: list[_Curve], n_frame: int) -> None:
+    factor, unit = angle_unit(np.concatenate([_rms(c.mrad) for c in curves]))
     for curve in curves:
         each = factor * _rms(curve.mrad)
         if len(ids) > MANY:
             some = np.sort(each[np.isfinite(each)])
-            by_mirror.plot(some, (np.arange(len(some)) + 0.5) / len(some), color=curve.colour, label=curve.label)
+            axes.plot(some, (np.arange(len(some)) + 0.5) / len(some), color=curve.colour, label=curve.label)
         else:
-            by_mirror.plot(
-                each, np.arange(len(ids)), curve.marker, color=curve.colour, ms=6, mew=1.6, label=curve.label
-            )
+            row = np.arange(len(ids))
+            axes.plot(each, row, curve.marker, color=curve.colour, ms=6, mew=1.6, label=curve.label)
     if len(ids) > MANY:
-        by_mirror.set_ylabel("part of the mirrors\nthat are better")
+        axes.set_ylabel("part of the mirrors\nthat are better")
     else:
-        by_mirror.set_yticks(range(len(ids)), ids, fontsize=8)
-        by_mirror.set_ylim(len(ids) - 0.4, -0.6)
-    by_mirror.set_xscale("log")
-    by_mirror.set_xlabel(f"angle of the normal{', RMS over frames' if n_frame > 1 else ''} [{unit}]")
-    plain_numbers(by_mirror.xaxis)
-    by_mirror.grid(alpha=0.3)
-    if n_frame > 1:
-        _over_frames(panels[1], result, curves)
-    figure.legend(*by_mirror.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    figure.suptitle(f"{result.scenario.name}: how good the normals are", fontsize=10)
-    return figure
+        axes.set_yticks(range(len(ids)), ids, fontsize=8)
+        axes.set_ylim(len(ids) - 0.4, -0.6)
+    axes.set_xscale("log")
+    axes.set_xlabel(f"angle of the normal{', RMS over frames' if n_frame > 1 else ''} [{unit}]")
+    plain_numbers(axes.xaxis)
+    axes.grid(alpha=0.3)
 
 
 def _over_frames(axes: Axes, result: Result, curves: list[_Curve]) -> None:

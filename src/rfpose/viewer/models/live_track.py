@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking.live import LiveField, Moment, live_scenario
-from rfpose.pipeline.pictures.track_view import Instant, instant_at
+from rfpose.pipeline.pictures.track_view import ON_RECEIVER, Instant, instant_at
 from rfpose.scenario import Scenario
 
 __all__ = ["DISTURBANCES", "LivePicture", "LiveTrack"]
@@ -114,7 +115,7 @@ class LiveTrack:
                 moment = self._field.step()
             self._n_step += 1
             seconds.append(self._n_step * self.step_s)
-            rms.append(1e3 * moment.rms_rad)
+            rms.append(_rms_mrad(_error_rad(moment)))
             if on_progress is not None:
                 on_progress(i + 1, n_step)
         if moment is None:
@@ -125,7 +126,12 @@ class LiveTrack:
             rms_mrad=read_only(np.array(rms)),
             time=str(np.datetime64(round(moment.unix_s), "s")),
             instant=instant_at(
-                moment.normal_enu, moment.error_rad, moment.sun_enu, self.pivot_enu_m, self.target_enu_m
+                moment.normal_enu,
+                _error_rad(moment),
+                moment.sun_enu,
+                self.pivot_enu_m,
+                self.target_enu_m,
+                mode=_shining(moment),
             ),
             sigma_mrad=1e3 * moment.radio_sigma_rad,
             wind_mps=moment.wind_mps,
@@ -136,3 +142,18 @@ class LiveTrack:
             dead=tuple(name for name, off in zip(self.transmitter_ids, moment.dead, strict=True) if off),
             over=self._field.over,
         )
+
+
+def _error_rad(moment: Moment) -> FloatArray:
+    """Return the errors of mirrors on the receiver (mirror,); one in stow or on its way there has none."""
+    return np.asarray(np.where(np.isin(_shining(moment), ON_RECEIVER), moment.error_rad, np.nan))
+
+
+def _shining(moment: Moment) -> npt.NDArray[np.int64]:
+    """Return modes (mirror,) as their light knows them: a mirror whose motors stand shines on, whatever it is told."""
+    return np.where(moment.stopped, int(Mode.TRACK), moment.mode).astype(np.int64)
+
+
+def _rms_mrad(error_rad: FloatArray) -> float:
+    known = error_rad[np.isfinite(error_rad)]
+    return 1e3 * float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
