@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -28,6 +29,7 @@ from rfpose.pipeline.pictures.track_view import (
 )
 from rfpose.pipeline.track import TrackChanges, track
 from rfpose.scenario import Scenario, load_scenario
+from rfpose.viewer.export import open_window
 from rfpose.viewer.views.tracking import TrackingView
 from rfpose.viewer.window import MainWindow
 
@@ -281,3 +283,16 @@ def test_picture_of_nobody_on_the_receiver(controlled: Track, tmp_path: Path) ->
         nothing[name] = dataclasses.replace(method, series=series, scores=scores)
     save_figure(dataclasses.replace(controlled, methods=nothing).plot(), tmp_path / "day.png")
     assert (tmp_path / "day.png").stat().st_size > 10_000
+
+
+def test_methods_in_the_window_have_the_numbers_of_the_command(qapp, runs: dict[str, Path]) -> None:
+    told = json.loads(CliRunner().invoke(_app.app, ["info", str(runs["control"]), "--json"]).stdout)["methods"]
+    _, window = open_window(runs["control"])
+    table = window.views["tracking"].table
+    rows = [[table.item(i, j).text() for j in range(table.columnCount())] for i in range(table.rowCount())]
+    assert [row[0] for row in rows] == list(told)
+    for name, _, rms, _, worst, caught, _ in rows:
+        assert rms == f"{told[name]['rms_mrad']:.3g}"
+        assert worst == f"{told[name]['worst_mrad']:.3g}"
+        assert caught == f"{100.0 * told[name]['intercept']:.2f} %"
+    window.close()
