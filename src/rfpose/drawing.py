@@ -172,11 +172,13 @@ def place_names(
     *,
     keep_off: FloatArray,
     colours: Sequence[str] | str,
+    n_always: int = 0,
     size: float = 7.0,
 ) -> None:
     """Write names beside places (place, xy), where they lie over no other name and none of ``keep_off`` (point, xy).
 
-    Call it when all else is drawn and limits stand. A name without room is left out.
+    Call it when all else is drawn and limits stand. A name without room is left out; of the first ``n_always`` it
+    stands on a ground of its own.
     """
     figure: Any = axes.figure.figure  # the whole, also of axes in a part
     figure.draw_without_rendering()
@@ -189,22 +191,32 @@ def place_names(
     frame = axes.get_window_extent()
     inside = tuple(to_points * v for v in (frame.x0, frame.y0, frame.x1, frame.y1))
     each = [colours] * len(names) if isinstance(colours, str) else list(colours)
-    for place, (x, y), name, colour in zip(places, here, names, each, strict=True):
+    for k, (place, (x, y), name, colour) in enumerate(zip(places, here, names, each, strict=True)):
         lines = name.split("\n")
         width, height = _LETTER * size * max(map(len, lines)), 1.25 * size * len(lines)
+        found, ground = None, None
         for away, (right, up) in ((away, way) for away in (6.5, 11.0) for way in _ROUND):
             left = x + right * away + (0.5 * np.sign(round(right, 1)) - 0.5) * width
             low = y + up * away + (0.5 * np.sign(round(up, 1)) - 0.5) * height
             box = (left, low, left + width, low + height)
-            free = not any(_overlap(box, other) for other in taken)
-            if free and box[0] > inside[0] and box[1] > inside[1] and box[2] < inside[2] and box[3] < inside[3]:
-                written = axes.annotate(
-                    name, place, (left - x + 0.5 * width, low - y + 0.5 * height), textcoords="offset points",
-                    fontsize=size, color=colour, ha="center", va="center", zorder=5,
-                )  # fmt: skip
-                written.set_in_layout(False)
-                taken.append(box)
+            if _within(box, inside) and not any(_overlap(box, other) for other in taken):
+                found = box
                 break
+        if found is None and k < n_always:
+            found = (x + 6.5, y - 0.5 * height, x + 6.5 + width, y + 0.5 * height)
+            ground = {"facecolor": figure.get_facecolor(), "edgecolor": "none", "alpha": 0.75, "pad": 0.5}
+        if found is not None:
+            offset = (found[0] - x + 0.5 * width, found[1] - y + 0.5 * height)
+            written = axes.annotate(
+                name, place, offset, textcoords="offset points", fontsize=size, color=colour, ha="center", va="center",
+                zorder=6, bbox=ground,
+            )  # fmt: skip
+            written.set_in_layout(False)
+            taken.append(found)
+
+
+def _within(box: tuple[float, ...], frame: tuple[float, ...]) -> bool:
+    return box[0] > frame[0] and box[1] > frame[1] and box[2] < frame[2] and box[3] < frame[3]
 
 
 def _overlap(one: tuple[float, ...], other: tuple[float, ...]) -> bool:

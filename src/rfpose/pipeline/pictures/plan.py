@@ -72,4 +72,4 @@ def finish_plan(
     names = [*scenario.transmitter_ids, *(r.id for r in scenario.calibration_receiver), *(texts[i] for i in kept)]
     places = np.concatenate([scenario.transmitter_enu_m[:, :2], calibration[:, :2], mirrors[list(kept), :2]])
     colours = [VERMILION] * len(scenario.transmitter_ids) + [PINK] * len(calibration) + [ink] * len(list(kept))
-    place_names(axes, places, names, keep_off=marks, colours=colours)
+    place_names(axes, places, names, keep_off=marks, colours=colours, n_always=len(names) - len(list(kept)))
