@@ -250,10 +250,11 @@ class SitePlacement(Shown):
         RecordingError
             The file exists, or cannot be written.
         """
-        if self.source is None:
+        text = None if self.source is None else edited(self.source, self.scenario, folder=Path(path).resolve().parent)
+        if text is None:
             self.scenario.save(path, force=force)
         else:
-            write_atomically(path, edited(self.source, self.scenario).encode(), force=force)
+            write_atomically(path, text.encode(), force=force)
 
     def plot(self) -> Figure:
         """Draw the field before and after, each mirror in the colour of its PDOP or of its normal's bound."""

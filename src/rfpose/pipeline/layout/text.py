@@ -17,8 +17,10 @@ __all__ = ["edited"]
 _LARGEST = 2**26
 
 
-def edited(source: str | Path, scenario: Scenario) -> str:
-    """Return the text of a scenario's file with the transmitters of ``scenario``.
+def edited(source: str | Path, scenario: Scenario, *, folder: Path) -> str | None:
+    """Return the text of a scenario's file with the transmitters of ``scenario``, to stand in ``folder``.
+
+    None: it names tables that are not found from there.
 
     Lengths stand in the file before its ``scale``, and are written so. Blockages of transmitters that are gone go.
 
@@ -41,8 +43,12 @@ def edited(source: str | Path, scenario: Scenario) -> str:
         del listed[-1]
     _drop_blockages(document, {each.id for each in scenario.transmitter})
     changed = tomlkit.dumps(document)
-    parse_scenario(changed, source=f"{source} with other transmitters")
-    return changed
+    try:
+        found = parse_scenario(changed, source=f"{source} with other transmitters", folder=folder)
+    except ScenarioError:
+        parse_scenario(changed, source=f"{source} with other transmitters", folder=Path(source).parent)
+        return None
+    return changed if found.heliostat_ids == scenario.heliostat_ids else None
 
 
 def _set(table: Any, wanted: Transmitter, scale: float) -> None:
