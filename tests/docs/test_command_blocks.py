@@ -125,8 +125,8 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder / "data" / path.name)
     field_name = "tracking_100m.toml"
     field = rf.load_scenario(ROOT / "data" / field_name)
-    short = {"first_hour": 11.4, "last_hour": 12.1, "stored": 1, "settle_s": 20.0}
-    field.changed(heliostat=field.heliostat[:2], tracking=short).save(
+    short = {"first_hour": 11.9, "last_hour": 12.0, "stored": 1, "settle_s": 20.0}
+    field.changed(heliostat=field.heliostat[:1], tracking=short).save(
         folder / "data" / "tracking_100m.toml", force=True
     )
     return folder
