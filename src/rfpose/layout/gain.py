@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
-from rfpose.layout.maps import Mirrors, _plane_slope
+from rfpose.layout.maps import Mirrors, plane_slope
 from rfpose.measurement import Estimator, Noise, clock_classes
 
 __all__ = ["Gain", "Reflection", "gain_of", "normal_gain"]
@@ -197,7 +197,7 @@ def _independent(
     centred = u - (mean / np.where(total > 0.0, total, 1.0))[:, :, :, None]
     rows = weight[..., None] * centred
     place_gain = _inverse(np.einsum("mgrta,mgrtb->mrab", rows, centred))
-    slope = np.broadcast_to(_plane_slope(mirrors.receiver_mirror_m), (n_mirror, n_receiver, 3, 3))[:, :, :2]
+    slope = np.broadcast_to(plane_slope(mirrors.receiver_mirror_m), (n_mirror, n_receiver, 3, 3))[:, :, :2]
     by_place = np.einsum("mrkc,mac->mrka", slope, mirrors.rot_enu_from_mirror)
     out = np.einsum("mrka,mrab,mgrtb->mkgrt", by_place, place_gain, rows)
     # a receiver that is located by itself takes what is common to all of a mirror's for noise of its own; the normal's

@@ -279,10 +279,10 @@ def normal_map(
     seen = _mask(visible, (n_mirror, n_receiver, n_transmitter), (n_mirror, n_receiver))
     range2 = 0.0 if noise.reference_range_m is None else noise.reference_range_m**2
     out = np.full(n_mirror, np.nan)
-    field_seen = _field(transmitter, mirrors, range2, seen)
+    field_seen = kernel_field(transmitter, mirrors, range2, seen)
     if not estimator.rigid:
         _kernels.tilt_independent(
-            n_mirror, field_seen, _plane_slope(mirrors.receiver_mirror_m), noise.tone_sigma_m**2,
+            n_mirror, field_seen, plane_slope(mirrors.receiver_mirror_m), noise.tone_sigma_m**2,
             noise.calibration_sigma_m**2, _MIN_TRANSMITTER[3], out,
         )  # fmt: skip
         return np.asarray(np.sqrt(out))
@@ -307,7 +307,7 @@ def normal_map(
     return np.asarray(np.sqrt(out))
 
 
-def _field(
+def kernel_field(
     transmitter: FloatArray, mirrors: Mirrors, range2: float = 0.0, seen: npt.NDArray[np.uint8] | None = None
 ) -> _kernels.Field:
     """Return what the kernels take; ``range2`` and ``seen`` as there."""
@@ -323,7 +323,7 @@ def _field(
     )
 
 
-def _plane_slope(receiver_mirror_m: FloatArray) -> FloatArray:
+def plane_slope(receiver_mirror_m: FloatArray) -> FloatArray:
     """(mirror, receiver, 3, 3) derivative of the plane's unit normal by each receiver's place, in the mirror frame.
 
     The plane is the affine image of the mirror's x-y plane, as `rfpose.multilat.mirror_normal` takes it.

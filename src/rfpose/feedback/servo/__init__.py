@@ -1,5 +1,6 @@
 """The servo that follows the sun: law, stepper, margins, response in time, counts of motor moves, rules of thumb."""
 
+from rfpose.feedback.servo._kernels import DriveNumbers
 from rfpose.feedback.servo.law import PiLaw, ServoState, Stepper, servo_step
 from rfpose.feedback.servo.margins import (
     Margins,
@@ -14,6 +15,7 @@ from rfpose.feedback.servo.margins import (
 from rfpose.feedback.servo.response import MotorCounts, Response, count_motor, run_loop
 
 __all__ = [
+    "DriveNumbers",
     "Margins",
     "MotorCounts",
     "PiLaw",

@@ -9,8 +9,7 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.servo import Stepper
-from rfpose.feedback.servo._kernels import DriveNumbers
+from rfpose.feedback.servo import DriveNumbers, Stepper
 from rfpose.feedback.servo.margins import LEAST_GAIN_MARGIN, Margins, margins
 from rfpose.feedback.servo.rules import EARTH_RADPS
 from rfpose.feedback.structure import Structure

@@ -42,6 +42,11 @@ class Method:
     radio: bool = False
     collectors: tuple[str, ...] = ("heliostat", "dish")
 
+    @property
+    def closes_by_radio(self) -> bool:
+        """Whether its loop is closed by radio."""
+        return self.feedback == _kernels.RADIO
+
 
 METHODS: dict[str, Method] = {
     m.name: m

@@ -17,7 +17,7 @@ from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.layout.maps import Mirrors
 from rfpose.layout.optimise.rules import Constraints, Costs
-from rfpose.layout.optimise.search import _FEASIBLE, Placement, Progress, _draw, _Problem, _problem, _statistic
+from rfpose.layout.optimise.search import FEASIBLE, Placement, Problem, Progress, draw_places, problem_of, statistic_of
 
 __all__ = ["Measure", "exchange", "measured"]
 
@@ -34,7 +34,7 @@ _NEAR = 0.15
 def measured(measure: Measure, transmitter_enu_m: npt.ArrayLike, statistic: str) -> float:
     """Return rms, worst or percentile over the field of what a measure says of transmitters (transmitter, xyz)."""
     place = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    return _statistic(measure(place), statistic, smooth=False)[0]
+    return statistic_of(measure(place), statistic, smooth=False)[0]
 
 
 def exchange(
@@ -82,7 +82,7 @@ def exchange(
     if tries < 2:
         raise InvalidInputError(f"`tries` must be at least two, got {tries}")
     existing = begin.transmitter_enu_m[: begin.n_existing]
-    problem = _problem(field, "rigid", begin.statistic, 1.0, existing, constraints)
+    problem = problem_of(field, "rigid", begin.statistic, 1.0, existing, constraints)
     starts = [begin.transmitter_enu_m]
     for other in also_from:
         place = as_float_array("also_from", other, begin.transmitter_enu_m.shape)
@@ -118,23 +118,23 @@ def exchange(
     )
 
 
-def _meets(problem: _Problem, site: FloatArray) -> bool:
+def _meets(problem: Problem, site: FloatArray) -> bool:
     """Return whether the new towers of a site meet the constraints."""
     low, high = problem.constraints.height_m
     new = site[len(problem.existing) :]
     inside = bool(np.all((new[:, 2] >= low) & (new[:, 2] <= high)))
     stays = np.allclose(site[: len(problem.existing)], problem.existing)
-    return inside and stays and bool(problem.margins(new.ravel() / problem.scale).min() >= -_FEASIBLE)
+    return inside and stays and bool(problem.margins(new.ravel() / problem.scale).min() >= -FEASIBLE)
 
 
 def _other_places(
-    problem: _Problem, site: FloatArray, tower: int, tries: int, near: float, rng: np.random.Generator
+    problem: Problem, site: FloatArray, tower: int, tries: int, near: float, rng: np.random.Generator
 ) -> FloatArray:
     """(place, xyz) where a tower could stand, the others staying."""
     others = np.delete(site, tower, axis=0)
     alone = replace(problem, existing=others)
     low, high = problem.constraints.height_m
-    anywhere = np.concatenate([_draw(alone, 1, rng) for _ in range(tries // 2)])
+    anywhere = np.concatenate([draw_places(alone, 1, rng) for _ in range(tries // 2)])
     step = near * problem.scale * rng.standard_normal((4 * tries, 3)) * [1.0, 1.0, 0.5]
     close = site[tower] + step
     close[:, 2] = np.clip(close[:, 2], low, high)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.jit import one_thread
-from rfpose.layout.maps import Mirrors, _field, _plane_slope
+from rfpose.layout.maps import Mirrors, kernel_field, plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
 
@@ -39,7 +39,7 @@ _ATTEMPTS = 20
 _WORST_POWER = 12.0
 _BAND = 0.02
 """Width of the ranks that stand for a percentile while searching, so that it has a slope."""
-_FEASIBLE = 1e-6
+FEASIBLE = 1e-6
 _FEW_POINTS = 5000
 """Field points below which a search keeps to one core."""
 
@@ -77,7 +77,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class _Problem:
+class Problem:
     """Objective and constraints over the flat, scaled coordinates of the new towers."""
 
     field: Mirrors
@@ -97,7 +97,7 @@ class _Problem:
         variance, slope = _rows(self.site(x), self.field, self.criterion, self.sigma_m)
         if not np.isfinite(variance).all() or variance.min() <= 0.0:
             return 50.0, np.zeros(x.size)
-        value, weight = _statistic(variance, self.statistic, smooth=True)
+        value, weight = statistic_of(variance, self.statistic, smooth=True)
         gradient = np.einsum("p,pta->ta", weight, slope)[len(self.existing) :]
         return float(np.log(value)), self.scale * gradient.ravel() / value
 
@@ -180,8 +180,8 @@ def _rows(
     value = np.empty(n)
     slope = np.zeros((n, len(transmitter), 3))
     _kernels.objective_rows(
-        n, CRITERIA[criterion], _field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
-        _plane_slope(field.receiver_mirror_m), value, slope,
+        n, CRITERIA[criterion], kernel_field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
+        plane_slope(field.receiver_mirror_m), value, slope,
     )  # fmt: skip
     return value, slope
 
@@ -193,7 +193,7 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
-def _statistic(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:
+def statistic_of(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:
     """Rms, worst or percentile of √variance, and its slope by each variance; smooth stand-ins for the search."""
     n = len(variance)
     if statistic == "rms":
@@ -232,7 +232,7 @@ def evaluate_placement(
     _check(criterion, statistic)
     transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
     variance, _ = _rows(transmitter, field, criterion, sigma_m)
-    return _statistic(variance, statistic, smooth=False)[0] if np.isfinite(variance).all() else float("nan")
+    return statistic_of(variance, statistic, smooth=False)[0] if np.isfinite(variance).all() else float("nan")
 
 
 def optimise(
@@ -293,10 +293,10 @@ def optimise(
         raise GeometryError(f"{len(existing)} transmitters exist already; `n_transmitter` must be larger")
     if starts < 1:
         raise InvalidInputError(f"`starts` must be at least one, got {starts}")
-    problem = _problem(field, criterion, statistic, as_positive("sigma_m", sigma_m), existing, constraints)
+    problem = problem_of(field, criterion, statistic, as_positive("sigma_m", sigma_m), existing, constraints)
     rng = np.random.default_rng(seed)
     begin = [as_float_array("also_from", x, (n_new, 3)) for x in also_from]
-    begin += [_draw(problem, n_new, rng) for _ in range(starts)]
+    begin += [draw_places(problem, n_new, rng) for _ in range(starts)]
     found: list[tuple[float, FloatArray]] = []
     value = np.full(len(begin), np.nan)
     for k, start in enumerate(begin):
@@ -326,13 +326,13 @@ def optimise(
     )
 
 
-def _problem(
+def problem_of(
     field: Mirrors, criterion: Criterion, statistic: str, sigma_m: float, existing: FloatArray, constraints: Constraints
-) -> _Problem:
+) -> Problem:
     from scipy.spatial import KDTree
 
     corners = np.vstack([corner for zone in constraints.allowed for corner in zone.box])
-    return _Problem(
+    return Problem(
         field, criterion, statistic, sigma_m, existing, constraints,
         scale=max(float(np.ptp(corners, axis=0).max()), 1e-9),
         heliostats=KDTree(field.pivot_enu_m[:, :2]) if constraints.clearance_m > 0.0 else None,
@@ -352,7 +352,7 @@ def _check(criterion: str, statistic: str) -> None:
         raise InvalidInputError(f"`statistic` must be rms, worst or a percentile such as p95, got {statistic!r}")
 
 
-def _draw(problem: _Problem, n_new: int, rng: np.random.Generator) -> FloatArray:
+def draw_places(problem: Problem, n_new: int, rng: np.random.Generator) -> FloatArray:
     """Random places (new transmitter, xyz) that meet the constraints, one tower after the other."""
     rules = problem.constraints
     boxes = np.array([zone.box for zone in rules.allowed])
@@ -378,7 +378,7 @@ def _draw(problem: _Problem, n_new: int, rng: np.random.Generator) -> FloatArray
     )
 
 
-def _search(problem: _Problem, start: FloatArray) -> FloatArray | None:
+def _search(problem: Problem, start: FloatArray) -> FloatArray | None:
     """SLSQP from one start; None where it ends outside the constraints."""
     n = len(start)
     low, high = (h / problem.scale for h in problem.constraints.height_m)
@@ -395,13 +395,13 @@ def _search(problem: _Problem, start: FloatArray) -> FloatArray | None:
         options={"maxiter": 300, "ftol": 1e-7},
     )
     x = np.asarray(result.x, np.float64)
-    if not np.isfinite(x).all() or problem.margins(x).min() < -_FEASIBLE:
+    if not np.isfinite(x).all() or problem.margins(x).min() < -FEASIBLE:
         return None
     x.reshape(-1, 3)[:, 2] = np.clip(x.reshape(-1, 3)[:, 2], low, high)
     return x
 
 
-def _value(problem: _Problem, x: FloatArray) -> float:
+def _value(problem: Problem, x: FloatArray) -> float:
     return evaluate_placement(
         problem.site(x),
         problem.field,
@@ -411,7 +411,7 @@ def _value(problem: _Problem, x: FloatArray) -> float:
     )
 
 
-def _without_worst(problem: _Problem, site: FloatArray) -> float:
+def _without_worst(problem: Problem, site: FloatArray) -> float:
     if len(site) <= 5:
         return float("nan")
     return float(

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.ambiguity import _kernels, integer_least_squares
+from rfpose.multilat.ambiguity import difference_many, integer_least_squares
 from rfpose.multilat.rigid.pose import RigidPoses
 from rfpose.multilat.rigid.problem import Knowledge
 
@@ -141,7 +141,7 @@ def search_integers(
         n = len(left)
         count, value, cov = np.zeros(n, np.int64), np.zeros((n, size)), np.zeros((n, size, size))
         row, column = np.zeros((n, size), np.int64), np.zeros((n, size), np.int64)
-        _kernels.difference_many(
+        difference_many(
             n, left, prediction.slope, prediction.cov, own_m2, common, clock_m2, wavelength_m, minus, reference,
             count, value, cov, row, column,
         )  # fmt: skip

@@ -52,7 +52,7 @@ BoolArray = npt.NDArray[np.bool_]
 ComplexArray = npt.NDArray[np.complex128]
 IntArray = npt.NDArray[np.int64]
 
-_MAX_STEPS = 100
+MAX_STEPS = 100
 _FIRST_FLOOR = 0.05
 _TAILS = (1.5, 2.0, 3.0, 8.0, 30.0, 300.0)
 _FIRST_TAIL = 3.0
@@ -322,9 +322,9 @@ def fit_site(
         Arrays that do not fit each other.
     """
     chosen = settings or SiteSettings()
-    fit = _Fit(observations, knowledge, chosen)
-    known, everyone, some = _who(knowledge)
-    common, state, before = _given(chosen), _State.begin(knowledge), 0j
+    fit = Fit(observations, knowledge, chosen)
+    known, everyone, some = who(knowledge)
+    common, state, before = given_common(chosen), State.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, some, common), some, common)
     for k in range(chosen.rounds + _MORE_ROUNDS):
@@ -333,12 +333,12 @@ def fit_site(
         before = common.soil_change
         # each time about the constants found last, as uncertain as they were given: rays are not linear in them
         common = replace(common, soil_sigma=chosen.soil_sigma)
-        common = fit.learn(_field_of(field_at, state, some, common), state, some, common)
-        state = fit.run(fit.prepare(_field_of(field_at, state, some, common)), state, some, common)
+        common = fit.learn(field_of(field_at, state, some, common), state, some, common)
+        state = fit.run(fit.prepare(field_of(field_at, state, some, common)), state, some, common)
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, everyone, common), everyone, common)
     # on the way there the ground counts as known: what it is uncertain by takes as long to foresee as all the rest
     for ground in (replace(common, soil_sigma=(0.0, 0.0)), common):
-        state = fit.run(fit.prepare(_field_of(field_at, state, everyone, ground)), state, everyone, ground)
+        state = fit.run(fit.prepare(field_of(field_at, state, everyone, ground)), state, everyone, ground)
     return fit.outcome(state, known, common)
 
 
@@ -349,7 +349,7 @@ def heard_by(
     return _Prepared.of(voltages, shape, mast).heard(settings, common)
 
 
-def _given(settings: SiteSettings) -> Common:
+def given_common(settings: SiteSettings) -> Common:
     """Return what is taken of all mirrors before any residual is seen."""
     return Common(
         floor=_FIRST_FLOOR if settings.floor is None else settings.floor,
@@ -360,7 +360,7 @@ def _given(settings: SiteSettings) -> Common:
     )
 
 
-def _who(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
+def who(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
     """Return which mirrors can be begun with, the same as rows, and rows spread over them from which all learn."""
     known = np.asarray(
         np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
@@ -370,7 +370,7 @@ def _who(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
     return known, everyone, everyone[spread[: len(everyone)]]
 
 
-def _field_of(field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> Voltages:
+def field_of(field_at: FieldAt, state: State, rows: IntArray, common: Common) -> Voltages:
     """Return what some mirrors would receive where they are found to be."""
     rot = np.full(state.rot.shape, np.nan)
     rot[rows] = state.rot[rows]
@@ -403,7 +403,7 @@ def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float)
 
 
 @dataclass(frozen=True, slots=True)
-class _State:
+class State:
     """Where the fit of each mirror stands; arrays as the kernel gives them, pose covariance in turn, then pivot."""
 
     pivot: FloatArray
@@ -420,7 +420,7 @@ class _State:
     ambiguous: BoolArray
 
     @classmethod
-    def begin(cls, known: SiteKnowledge) -> _State:
+    def begin(cls, known: SiteKnowledge) -> State:
         """Return mirrors as commanded, of which nothing is found yet."""
         n, n_rx = known.receiver_mirror_m.shape[:2]
         link = (n, n_rx, known.unit_field.shape[1])
@@ -431,11 +431,11 @@ class _State:
             dof=row.copy(), cost=row.copy(), steps=np.full(n, -1, np.int64), ambiguous=np.zeros(n, np.bool_),
         )  # fmt: skip
 
-    def copy(self) -> _State:
+    def copy(self) -> State:
         """Return one that may be written into."""
-        return _State(*(getattr(self, name).copy() for name in _State.__dataclass_fields__))
+        return State(*(getattr(self, name).copy() for name in State.__dataclass_fields__))
 
-    def with_poses_of(self, other: _State, rows: BoolArray) -> _State:
+    def with_poses_of(self, other: State, rows: BoolArray) -> State:
         """Return this with some mirrors where the other has them."""
         out = self.copy()
         out.pivot[rows], out.rot[rows] = other.pivot[rows], other.rot[rows]
@@ -443,14 +443,14 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class Told:
     """What measurements say of factor errors: (mirror, kind, 2) squares and shares told; (mirror, 2, 2) of the soil."""
 
     factor: FloatArray
     soil: FloatArray
 
     @classmethod
-    def of(cls, n: int) -> _Told:
+    def of(cls, n: int) -> Told:
         return cls(np.full((n, len(RayKind), 2), np.nan), np.full((n, 2, 2), np.nan))
 
 
@@ -470,7 +470,7 @@ def _alike(one: Common, other: Common) -> bool:
     return bool(max(change, abs(np.log(one.floor / other.floor))) < _LEARN_SETTLED)
 
 
-class _Fit:
+class Fit:
     """The kernel with everything that does not change from call to call."""
 
     def __init__(
@@ -479,7 +479,7 @@ class _Fit:
         knowledge: SiteKnowledge,
         settings: SiteSettings,
         *,
-        max_steps: int = _MAX_STEPS,
+        max_steps: int = MAX_STEPS,
     ) -> None:
         n, n_rx, n_tx = observations.carrier.shape
         if knowledge.receiver_mirror_m.shape != (n, n_rx, 3) or knowledge.unit_field.shape != (n, n_tx):
@@ -509,15 +509,13 @@ class _Fit:
             clock_info=clock_info,
         )
 
-    def run(
-        self, prepared: _Prepared, state: _State, rows: IntArray, common: Common, told: _Told | None = None
-    ) -> _State:
+    def run(self, prepared: _Prepared, state: State, rows: IntArray, common: Common, told: Told | None = None) -> State:
         """Fit some mirrors from where they stand; the others stay."""
         out = state.copy()
         out.scale[rows] = 1.0
         for values in (out.weight, out.residual, out.sigma):
             values[rows] = np.nan
-        told = _Told.of(0) if told is None else told
+        told = Told.of(0) if told is None else told
         _kernels.fit_mirrors(
             len(rows),
             rows,
@@ -537,7 +535,7 @@ class _Fit:
         """Sort rays as the kernel wants them."""
         return _Prepared.of(voltages, self.seen.carrier.shape, self.known.mast)
 
-    def learn(self, voltages: Voltages, state: _State, rows: IntArray, common: Common) -> Common:
+    def learn(self, voltages: Voltages, state: State, rows: IntArray, common: Common) -> Common:
         """Return what mirrors' residuals say of what all have in common (restricted maximum likelihood)."""
         prepared = self.prepare(voltages)
         best, chosen = self._learn_with(prepared, state, rows, common)
@@ -555,8 +553,8 @@ class _Fit:
                 break
         return chosen
 
-    def _learn_with(self, prepared: _Prepared, state: _State, rows: IntArray, common: Common) -> tuple[float, Common]:
-        told = _Told.of(len(state.cost))
+    def _learn_with(self, prepared: _Prepared, state: State, rows: IntArray, common: Common) -> tuple[float, Common]:
+        told = Told.of(len(state.cost))
         for _ in range(_LEARN_ROUNDS):
             state = self.run(prepared, state, rows, common, told)
             last, common = common, self._learned(state, told, rows, common)
@@ -567,7 +565,7 @@ class _Fit:
         total = float(np.nansum(cost)) if np.isfinite(cost).any() else np.inf
         return total, self.with_soil(told, rows, common)
 
-    def _learned(self, state: _State, told: _Told, rows: IntArray, common: Common) -> Common:
+    def _learned(self, state: State, told: Told, rows: IntArray, common: Common) -> Common:
         total, dof = state.total[rows], state.dof[rows]
         ended = np.isfinite(total) & (dof > 0.0)
         if not ended.any():
@@ -583,7 +581,7 @@ class _Fit:
         scale = np.clip(common.factor_scale * change, _LEAST_FACTOR_SCALE, 1.0 / _LEAST_FACTOR_SCALE)
         return replace(common, floor=max(floor, self.settings.least_floor), factor_scale=scale)
 
-    def with_soil(self, told: _Told, rows: IntArray, given: Common) -> Common:
+    def with_soil(self, told: Told, rows: IntArray, given: Common) -> Common:
         """Join what mirrors say of the ground's permittivity, each about the mean that was given."""
         estimate, share = np.moveaxis(np.nan_to_num(told.soil[rows]), 2, 0)
         share = np.clip(share, 0.0, 1.0 - 1e-9)
@@ -598,7 +596,7 @@ class _Fit:
             given, soil_change=given.soil_change + complex(*change), soil_sigma=(float(left[0]), float(left[1]))
         )
 
-    def outcome(self, state: _State, known: BoolArray, common: Common) -> SitePoses:
+    def outcome(self, state: State, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""
         from scipy.special import fdtri
 
@@ -617,7 +615,7 @@ class _Fit:
         level = worst * np.sqrt(2.0 * fdtri(2.0, freedom, 1.0 - self.settings.missed_detection))
         status[~(sigma <= MAX_SIGMA_RAD)] = PoseStatus.UNCERTAIN
         status[state.ambiguous] = PoseStatus.AMBIGUOUS
-        status[state.steps >= _MAX_STEPS] = PoseStatus.NOT_CONVERGED
+        status[state.steps >= MAX_STEPS] = PoseStatus.NOT_CONVERGED
         status[_redundancy(state.weight) < _TELLING] = PoseStatus.UNKNOWNS
         status[state.steps < 0] = PoseStatus.UNKNOWNS
         status[~known] = PoseStatus.NO_POSTURE
@@ -627,7 +625,7 @@ class _Fit:
         return replace(poses, protection_level_rad=np.where(lost, np.nan, level))
 
 
-def _roll_sigma_rad(knowledge: SiteKnowledge) -> FloatArray:
+def roll_sigma_rad_of(knowledge: SiteKnowledge) -> FloatArray:
     """(mirror,) how far orientations are off about their own normals."""
     normal = knowledge.commanded_rot[:, :, 2]
     sine = np.hypot(normal[:, 0], normal[:, 1])
@@ -640,7 +638,7 @@ def _posture_info(knowledge: SiteKnowledge) -> FloatArray:
     along = normal[:, :, None] * normal[:, None, :]
     across = knowledge.posture_sigma_rad[:, None, None] ** -2.0
     roll = np.where(
-        np.isfinite(knowledge.posture_sigma_rad), np.nan_to_num(_roll_sigma_rad(knowledge), nan=1.0) ** -2.0, 0.0
+        np.isfinite(knowledge.posture_sigma_rad), np.nan_to_num(roll_sigma_rad_of(knowledge), nan=1.0) ** -2.0, 0.0
     )
     return np.ascontiguousarray((np.eye(3) - along) * across + along * roll[:, None, None])
 
@@ -651,7 +649,7 @@ def _redundancy(weight: FloatArray) -> IntArray:
     return np.asarray(used.sum(axis=(1, 2)) - used.any(axis=1).sum(axis=1) - 6)
 
 
-def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> _State:
+def _of_all_starts(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, common: Common) -> State:
     """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
     knowledge = fit.known
     finite = knowledge.posture_sigma_rad[np.isfinite(knowledge.posture_sigma_rad)]
@@ -659,7 +657,7 @@ def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, 
     if not len(turns) or not len(rows):
         return state
     commanded = replace(state, pivot=knowledge.pivot_enu_m, rot=knowledge.commanded_rot)
-    near = fit.prepare(_field_of(field_at, commanded, rows, common))
+    near = fit.prepare(field_of(field_at, commanded, rows, common))
     state = fit.run(near, state, rows[state.steps[rows] < 0], common)
     turned = np.empty((3, 3))
     for w in turns:
@@ -670,16 +668,16 @@ def _of_all_starts(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, 
     return state
 
 
-def _of_all_rolls(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, common: Common) -> _State:
+def _of_all_rolls(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, common: Common) -> State:
     """Begin from elsewhere, too, where mirrors lie nearly flat, so that their roll is hardly known; keep the best."""
     knowledge = fit.known
-    roll = _roll_sigma_rad(knowledge)
+    roll = roll_sigma_rad_of(knowledge)
     step = _wavelength_m(fit) / 3.0 / _lever_m(fit)
     rows = rows[np.nan_to_num(roll[rows]) > step]
     if not len(rows):
         return state
     commanded = replace(state, pivot=knowledge.pivot_enu_m, rot=knowledge.commanded_rot)
-    near = fit.prepare(_field_of(field_at, commanded, rows, common))
+    near = fit.prepare(field_of(field_at, commanded, rows, common))
     n = int(np.ceil(2.0 * float(roll[rows].max()) / step))
     for k in (sign * j for j in range(1, n + 1) for sign in (1, -1)):
         there = rows[np.abs(k) * step <= 2.0 * roll[rows] + step]
@@ -692,15 +690,15 @@ def _of_all_rolls(fit: _Fit, field_at: FieldAt, state: _State, rows: IntArray, c
 
 
 def _from(
-    fit: _Fit, field_at: FieldAt, near: _Prepared, start: _State, state: _State, rows: IntArray, common: Common
-) -> _State:
+    fit: Fit, field_at: FieldAt, near: _Prepared, start: State, state: State, rows: IntArray, common: Common
+) -> State:
     """Fit some mirrors from another start; return what stood, with what is better, and what is as good marked."""
     apart_rad = _APART * _wavelength_m(fit) / _lever_m(fit)
     found = fit.run(near, start, rows, common)
     off = np.linalg.norm(found.rot[:, :, 2] - state.rot[:, :, 2], axis=1)
     mine = np.zeros(len(off), np.bool_)
     mine[rows] = True
-    ended = mine & (found.steps > 0) & (found.steps < _MAX_STEPS)
+    ended = mine & (found.steps > 0) & (found.steps < MAX_STEPS)
     other = ended & (off > apart_rad)
     better = ended & ((state.steps <= 0) | (found.cost < state.cost))
     alike = np.abs(found.cost - state.cost) < _AMBIGUOUS_COST
@@ -708,15 +706,15 @@ def _from(
     chosen = np.flatnonzero(better)
     if len(chosen):
         moved = state.with_poses_of(found, better)
-        state = fit.run(fit.prepare(_field_of(field_at, moved, chosen, common)), moved, chosen, common)
+        state = fit.run(fit.prepare(field_of(field_at, moved, chosen, common)), moved, chosen, common)
     return replace(state, ambiguous=ambiguous)
 
 
-def _lever_m(fit: _Fit) -> float:
+def _lever_m(fit: Fit) -> float:
     return max(float(np.nanmax(np.linalg.norm(fit.known.receiver_mirror_m, axis=-1), initial=0.0)), 1e-9)
 
 
-def _wavelength_m(fit: _Fit) -> float:
+def _wavelength_m(fit: Fit) -> float:
     return 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
 
 

@@ -16,21 +16,21 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.geometry import cross_matrix
 from rfpose.multilat.site.fit import (
-    _MAX_STEPS,
+    MAX_STEPS,
     Common,
     FieldAt,
+    Fit,
     SiteKnowledge,
     SiteObservations,
     SitePoses,
     SiteSettings,
+    State,
+    Told,
     Voltages,
-    _field_of,
-    _Fit,
-    _given,
-    _roll_sigma_rad,
-    _State,
-    _Told,
-    _who,
+    field_of,
+    given_common,
+    roll_sigma_rad_of,
+    who,
 )
 from rfpose.propagation import RayKind
 
@@ -152,24 +152,24 @@ class ForeseenMirrors:
             Arrays that do not fit each other.
         """
         chosen = settings or SiteSettings()
-        known, everyone, some = _who(knowledge)
-        common = _given(chosen)
-        voltages = _field_of(field_at, _State.begin(knowledge), everyone, common)
+        known, everyone, some = who(knowledge)
+        common = given_common(chosen)
+        voltages = field_of(field_at, State.begin(knowledge), everyone, common)
         link = np.repeat(np.arange(len(voltages.rays.first) - 1), np.diff(voltages.rays.first))
         mirrors = cls(
             sigma=sigma, wavenumber_radpm=wavenumber_radpm, knowledge=knowledge, settings=chosen, voltages=voltages,
             common=common, _link=link,
         )  # fmt: skip
-        fit, told = mirrors._fit(mirrors.received()), _Told.of(len(known))
-        fit.run(fit.prepare(voltages), _State.begin(knowledge), some, common, told)
+        fit, told = mirrors._fit(mirrors.received()), Told.of(len(known))
+        fit.run(fit.prepare(voltages), State.begin(knowledge), some, common, told)
         return replace(mirrors, common=fit.with_soil(told, some, common))
 
     def poses(self) -> SitePoses:
         """Return what the fit would state."""
         fit = self._fit(self.received())
-        known, everyone, _ = _who(self.knowledge)
+        known, everyone, _ = who(self.knowledge)
         # one step from the truth: residuals are zero, so that links keep the weight that they have on average
-        state = fit.run(fit.prepare(self.voltages), _State.begin(self.knowledge), everyone, self.common)
+        state = fit.run(fit.prepare(self.voltages), State.begin(self.knowledge), everyone, self.common)
         return fit.outcome(state, known, self.common)
 
     def share(self, source: str) -> FloatArray:
@@ -210,24 +210,24 @@ class ForeseenMirrors:
             Take one step only, which is right for a small disturbance.
         """
         known, off = self.knowledge, disturbance
-        _, everyone, _ = _who(known)
+        _, everyone, _ = who(known)
         told = replace(
             known,
             pivot_enu_m=known.pivot_enu_m + off.pivot_m,
             commanded_rot=_turned(known.commanded_rot, np.broadcast_to(off.posture_rad, known.pivot_enu_m.shape)),
         )
-        fit = self._fit(self.received(off), knowledge=told, max_steps=1 if linear else _MAX_STEPS)
-        state = fit.run(fit.prepare(self.voltages), _State.begin(known), everyone, self.common)
-        ended = (state.steps >= 0) & (linear | (state.steps < _MAX_STEPS))
+        fit = self._fit(self.received(off), knowledge=told, max_steps=1 if linear else MAX_STEPS)
+        state = fit.run(fit.prepare(self.voltages), State.begin(known), everyone, self.common)
+        ended = (state.steps >= 0) & (linear | (state.steps < MAX_STEPS))
         return np.asarray(np.where(ended[:, None], state.rot[:, :, 2] - known.commanded_rot[:, :, 2], np.nan))
 
     def drawn(self, source: str, rng: np.random.Generator) -> Disturbance:
         """Return what one of `SOURCES` may do, drawn at random; zeros where it does nothing."""
         return _DRAWS.get(source, _draw_factor)(self, source, rng)
 
-    def _fit(self, carrier: ComplexArray, *, knowledge: SiteKnowledge | None = None, max_steps: int = 1) -> _Fit:
+    def _fit(self, carrier: ComplexArray, *, knowledge: SiteKnowledge | None = None, max_steps: int = 1) -> Fit:
         observed = SiteObservations(carrier=carrier, sigma=self.sigma, wavenumber_radpm=self.wavenumber_radpm)
-        return _Fit(observed, knowledge or self.knowledge, self.settings, max_steps=max_steps)
+        return Fit(observed, knowledge or self.knowledge, self.settings, max_steps=max_steps)
 
     def _scaled(self, source: str, variance: float) -> ForeseenMirrors:
         """Return it with one source's variance so many times as large."""
@@ -360,7 +360,7 @@ def _draw_roll(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Di
     if not np.isfinite(known.roll_sigma_rad):
         return Disturbance()
     steep = np.maximum(np.abs(known.commanded_rot[:, 2, 1]), 1e-9)
-    turn = np.minimum(known.roll_sigma_rad / steep, _roll_sigma_rad(known)) * rng.standard_normal(len(steep))
+    turn = np.minimum(known.roll_sigma_rad / steep, roll_sigma_rad_of(known)) * rng.standard_normal(len(steep))
     # receivers that turn about the normal leave it where it is
     return Disturbance(place_m=np.cross([0.0, 0.0, 1.0], known.receiver_mirror_m) * turn[:, None, None])
 

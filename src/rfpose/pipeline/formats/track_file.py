@@ -20,7 +20,6 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import METHODS, Score, Simulation, score
-from rfpose.feedback.tracking._kernels import RADIO
 from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
@@ -268,7 +267,7 @@ class Track(Shown, Tabled):
 
     def _margins(self) -> dict[str, float] | None:
         """Return what the radio loop bears until it oscillates; None without radio in a loop."""
-        if not any(METHODS[name].feedback == RADIO for name in self.methods if name in METHODS):
+        if not any(METHODS[name].closes_by_radio for name in self.methods if name in METHODS):
             return None
         found = loop_margins_of(self.scenario)
         return {
