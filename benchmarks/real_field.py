@@ -119,6 +119,8 @@ class Spec:
         Factor on the ground's true constants in what the solver is told; None: that there is no ground.
     transmitters
         ``10`` those of Table 2, ``5`` and ``20`` fewer and more, ``high`` all 30 m higher.
+    carriers, band_mhz
+        So many carriers at each transmitter's antenna, spread evenly over a band.
     target_mrad
         Rms to be reached; None: not stated.
     today
@@ -135,6 +137,8 @@ class Spec:
     told: str = "none"
     ground: float | None = 1.0
     transmitters: str = "10"
+    carriers: int = 1
+    band_mhz: float = 0.0
     target_mrad: float | None = None
     today: str = ""
 
@@ -194,6 +198,12 @@ def specs() -> Iterator[Spec]:
     for mhz in (100.0, 433.0, 2400.0):
         yield Spec(
             name=f"isotropic, no own plate, {mhz:.0f} MHz; beside", mhz=mhz, place="beside", variant="everything",
+        )  # fmt: skip
+    for mhz, carriers, band_mhz in ((433.0, 2, 25.0), (433.0, 4, 25.0), (433.0, 4, 100.0), (2400.0, 2, 80.0),
+                                    (2400.0, 4, 80.0), (2400.0, 8, 80.0)):  # fmt: skip
+        yield Spec(
+            name=f"isotropic, no own plate, {mhz:.0f} MHz, {carriers} carriers over {band_mhz:.0f} MHz; beside",
+            mhz=mhz, place="beside", variant="everything", carriers=carriers, band_mhz=band_mhz,
         )  # fmt: skip
 
 
@@ -415,7 +425,21 @@ def posture_table(site: Scenario, normal: Array) -> Path:
 
 def _true_site(spec: Spec) -> Scenario:
     place_m = None if spec.transmitters == "10" else traced.TRANSMITTERS_ENU_M[spec.transmitters]
-    return site_of(1e6 * spec.mhz, spec.place, transmitter_enu_m=place_m)
+    site = site_of(1e6 * spec.mhz, spec.place, transmitter_enu_m=place_m)
+    if spec.carriers == 1:
+        return site
+    # steps that differ by some kilohertz, or lines of one step would fall on those of another
+    step = 1e6 * spec.band_mhz * (np.arange(spec.carriers) / (spec.carriers - 1) - 0.5) + 3e3 * np.arange(spec.carriers)
+    rate_hz = 2.2e6 * spec.band_mhz + 40e6
+    return site.changed(
+        radio={"sample_rate_hz": rate_hz, "frame_samples": round(2.5e-3 * rate_hz)},
+        transmitter=[
+            {"id": f"{t.id}_{k}", "position_enu_m": t.position_enu_m, "carrier_hz": round(t.carrier_hz + hz)}
+            | ({"mast": f"{t.id}_0"} if k else {})
+            for t in site.transmitter
+            for k, hz in enumerate(step.tolist())
+        ],
+    )
 
 
 def _told_site(spec: Spec, truth: Scenario) -> Scenario:
@@ -463,6 +487,7 @@ def _lines(spec: Spec, folders: Folders, site: Scenario, sun: int, rot: Array) -
     table = table.without(spec.drop).at(site, spec.place)
     if spec.transmitters == "5":
         table = table.from_transmitters(traced.FIVE)
+    table = table.of_carriers(spec.carriers)
     if spec.antenna == "isotropic":
         return lines_of(site, table, antenna_isotropic(table, rot))
     pattern = folders.pattern(spec.place, spec.mhz)

@@ -208,6 +208,14 @@ class Table:
         kept = self.only(new[self.tx] >= 0)
         return replace(kept, tx=new[kept.tx], tx_enu_m=self.tx_enu_m[np.asarray(index)])
 
+    def of_carriers(self, n: int) -> Table:
+        """Return the rays of n carriers at each transmitter's antenna, one after the other."""
+        each = [replace(self, tx=n * self.tx + k, tx_enu_m=np.repeat(self.tx_enu_m, n, axis=0)) for k in range(n)]
+        whole = each[0]
+        for other in each[1:]:
+            whole = whole.and_rays_of(other)
+        return whole
+
     def meets_own_plate(self) -> npt.NDArray[np.bool_]:
         """(ray,) whether it met the plate of the receiver's own mirror."""
         own = [name.split(":")[-1].split("_")[0] for name in map(str, self.rx_names)]

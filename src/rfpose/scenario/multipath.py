@@ -52,6 +52,8 @@ class Multipath(Record):
     """Whose edges bend rays: of boxes and plates, or of boxes alone."""
     wedge: Literal["uniform", "sionna"] = "uniform"
     """Coefficients of diffraction: exact for metal half-planes; or those of Sionna RT, to compare with its tables."""
+    detour_m: Annotated[float, Field(gt=0, le=1000)] = 1.0
+    """Mean detour of what nothing foresees: carriers of one antenna closer than c / 2π detour hear the same of it."""
     floor: Annotated[float, Field(gt=0, le=10)] | None = None
     """Strength of what nothing foresees, relative to the direct ray; without it found from residuals."""
     tail: Annotated[float, Field(ge=1)] | None = None

@@ -21,12 +21,16 @@ _FREE = 1e-3
 
 
 class Seen(NamedTuple):
-    """`SiteObservations`, and the strength of each transmitter's direct field (mirror, transmitter)."""
+    """`SiteObservations`, the strength of each transmitter's direct field (mirror, transmitter), and its crowd.
+
+    The crowd (transmitter,) is how many carriers of one antenna hear the same of what nothing foresees.
+    """
 
     carrier: Any
     sigma: Any
     wavenumber: Any
     unit_field: Any
+    crowd: Any
 
 
 class Heard(NamedTuple):
@@ -623,7 +627,16 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
         out.dof[m] = dof
         for q in range(6):
             last[q, 0] = gradient[q, 0]
-        # expected information of Student's t (Lange et al., section 4), of what has that distribution
+        # expected information of Student's t (Lange et al., section 4), of what has that distribution; and what nothing
+        # foresees is one witness where several carriers hear the same of it
+        for i in range(n):
+            link = link_at[i]
+            r, t = link // n_tx, link % n_tx
+            stray = (
+                variance[i] - sigma[m, r, t] ** 2 / size[i] ** 2 - heard.vague[m * n_link + link] / abs(h[link]) ** 2
+            )
+            out.sigma[m, r, t] = np.sqrt(variance[i])
+            variance[i] += (seen_links.crowd[t] - 1.0) * max(stray, 0.0)
         whitened_rows(
             begin, end, heard, part, h, slope_h, k_tx, row_of, link_at, residual, variance, weight,
             (nu + 3.0) / (nu + 1.0), share, touched, n, n_clock, s, lower, a,
@@ -654,4 +667,3 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
             r, t = link_at[i] // n_tx, link_at[i] % n_tx
             out.weight[m, r, t] = weight[i]
             out.residual[m, r, t] = residual[i]
-            out.sigma[m, r, t] = np.sqrt(variance[i])

@@ -204,6 +204,9 @@ class SiteSettings:
         By `RayKind`: standard deviation of foreseen rays' factors, relative amplitude and phase [rad].
     soil_sigma
         Standard deviation of the relative change of the ground's complex permittivity, real and imaginary part.
+    detour_m
+        Mean detour of what nothing foresees [m]: carriers of one antenna that are not far enough apart to tell it from
+        the direct ray hear the same of it, and count as one.
     missed_detection
         Risk at which protection levels are exceeded.
     rounds
@@ -216,6 +219,7 @@ class SiteSettings:
     own_scale: float = 8.0
     factor_sigma: dict[RayKind, tuple[float, float]] = field(default_factory=lambda: dict(_FACTOR_SIGMA))
     soil_sigma: tuple[float, float] = (0.3, 0.1)
+    detour_m: float = 1.0
     missed_detection: float = 1e-3
     rounds: int = 3
 
@@ -494,6 +498,7 @@ class Fit:
             np.ascontiguousarray(observations.sigma, np.float64),
             np.ascontiguousarray(observations.wavenumber_radpm, np.float64),
             np.ascontiguousarray(knowledge.unit_field, np.float64),
+            alike(observations.wavenumber_radpm, knowledge.mast, settings.detour_m).sum(axis=1),
         )
         with np.errstate(divide="ignore"):
             pivot_info, roll_info, clock_info = (
@@ -623,6 +628,17 @@ class Fit:
         for values in (poses.pivot_enu_m, poses.rot_enu_from_mirror, poses.cov, poses.floor):
             values[lost] = np.nan
         return replace(poses, protection_level_rad=np.where(lost, np.nan, level))
+
+
+def alike(wavenumber_radpm: FloatArray, mast: IntArray | None, detour_m: float) -> FloatArray:
+    """(transmitter, transmitter) how far carriers of one antenna hear the same of what nothing foresees, 0 to 1.
+
+    The correlation of a ray of random phase and exponentially distributed detour.
+    """
+    n = len(wavenumber_radpm)
+    sender = np.arange(n) if mast is None else mast
+    apart = np.subtract.outer(wavenumber_radpm, wavenumber_radpm) * detour_m
+    return np.where(np.equal.outer(sender, sender), 1.0 / np.hypot(1.0, apart), 0.0)
 
 
 def roll_sigma_rad_of(knowledge: SiteKnowledge) -> FloatArray:

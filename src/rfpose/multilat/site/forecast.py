@@ -27,6 +27,7 @@ from rfpose.multilat.site.fit import (
     State,
     Told,
     Voltages,
+    alike,
     field_of,
     given_common,
     roll_sigma_rad_of,
@@ -306,7 +307,9 @@ def _draw_floor(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> D
     shape, nu = mirrors.sigma.shape, mirrors.common.tail
     heavy = np.sqrt(nu / rng.chisquare(nu, shape))
     strength = mirrors.common.floor * mirrors.knowledge.unit_field[:, None]
-    return Disturbance(stray=strength * heavy * _complex(rng, shape))
+    together = alike(mirrors.wavenumber_radpm, mirrors.knowledge.mast, mirrors.settings.detour_m)
+    drawn = _complex(rng, shape) @ np.linalg.cholesky(together + 1e-9 * np.eye(shape[2])).T
+    return Disturbance(stray=np.asarray(strength * heavy * drawn, np.complex128))
 
 
 def _draw_pattern(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:

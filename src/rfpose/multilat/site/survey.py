@@ -33,6 +33,7 @@ from rfpose.multilat.site.fit import (
     SitePoses,
     SiteSettings,
     Voltages,
+    alike,
     fit_site,
     heard_by,
 )
@@ -542,6 +543,8 @@ class _Linear:
         nu = poses.common.tail
         self._heavy = (nu + 3.0) / (nu + 1.0)
         """How much more variance links have than their weights say: expected information of Student's t."""
+        wave = system.seen.wavenumber_radpm
+        self._crowd = alike(wave, system.known.mast, settings.detour_m).sum(axis=1)
 
     def reduced(self, row: int, rows: _Rows, worth: float) -> FloatArray:
         """Return rows (link, constant + 1) of a frame that counts so much, pose and phases taken out."""
@@ -593,7 +596,7 @@ class _Linear:
         beta = np.zeros(n_tx, np.complex128)
         np.add.at(beta, transmitter, off * weight[use] / variance)
         left = np.angle(off * beta[transmitter].conj())
-        covariance = np.diag(self._heavy * variance / weight[use])
+        covariance = np.diag(self._heavy * self._crowd[transmitter] * variance / weight[use])
         row_of = np.full(n_link, -1, np.int64)
         row_of[use] = k
         share, touched = np.zeros(n_link, np.complex128), np.empty(n_link, np.int64)

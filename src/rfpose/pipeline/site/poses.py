@@ -156,6 +156,7 @@ def settings_of(scenario: Scenario) -> SiteSettings:
             RayKind.OWN_PLATE: table.own_plate_sigma,
         },
         soil_sigma=table.permittivity_sigma,
+        detour_m=table.detour_m,
         missed_detection=scenario.integrity.missed_detection,
         rounds=table.rounds,
     )
