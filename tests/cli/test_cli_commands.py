@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any, get_args
 
@@ -66,7 +67,10 @@ def test_process_prints_counts_and_reasons(directory: Path, tmp_path: Path) -> N
     assert "mirror poses" in shown.stdout
     assert "1 poses: fewer than three receivers of the mirror were located" in shown.stdout
     assert "18 transmitters: carrier not found above the noise" in shown.stdout
-    assert shown.stderr == ""
+    # that kernels are compiled, and how far it is, where that takes its time
+    assert [
+        line for line in shown.stderr.splitlines() if not re.match("rfpose: (note: compiling|Measuring)", line)
+    ] == []
 
 
 def test_evaluate(directory: Path) -> None:

@@ -51,4 +51,4 @@ def test_shipped_scenario(path: Path, tmp_path: Path) -> None:
     mapped = run("layout", "map", site)
     assert mapped["normal_mrad"]["scenario"]["undetermined"] == 0.0
     for file in (site, result):
-        run("view", file, "--save", tmp_path / f"{file.stem}.png", "--size", 900, 600)
+        run("view", file, "--save", tmp_path / f"{file.stem}.png")

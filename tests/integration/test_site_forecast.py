@@ -261,7 +261,7 @@ def test_what_a_wall_does_is_in_the_budget_of_straight_rays() -> None:
     assert "reflections of the site" not in names["plain"]
     line = next(x for x in told["walled"]["lines"] if x["source"] == "reflections of the site")
     assert line["monte_carlo_mrad"] == pytest.approx(line["normal_mrad"], rel=0.05)
-    assert "--pose site" in line["remedy"]
+    assert "pose `site`" in line["remedy"]
 
 
 def test_transmitters_placed_for_pose_site_are_what_its_map_says() -> None:

@@ -81,7 +81,8 @@ def test_examples_in_docstrings(name: str) -> None:
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
     for test in tests:
         runner.run(test)
-    assert any(test.examples for test in tests) or name == "shipped_scenario"
+    # a pattern wants recordings of ten postures: tests/integration/test_learn_pattern.py
+    assert any(test.examples for test in tests) or name in ("shipped_scenario", "learn_pattern")
     assert runner.summarize(verbose=False).failed == 0
 
 
@@ -313,7 +314,7 @@ def test_files_without_named_dimensions_still_open(result: Result, day: Track, t
 def test_missing_library_says_how_to_install_it(result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("xarray", "pandas"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InvalidInputError, match=r"needs xarray; install it, .*rfpose\[labelled\]"):
+    with pytest.raises(InvalidInputError, match=r"needs xarray; install it, `pip install .*xarray>="):
         result.to_xarray()
     with pytest.raises(InvalidInputError, match=r"needs pandas; install it"):
         result.to_pandas()
@@ -349,5 +350,8 @@ def test_the_library_names_no_options() -> None:
         described = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in described:
-                named += [f"{path.name}: {node.value}"] if re.search(r"(^|\W)--[a-z]", node.value) else []
+                styles = node.value.lstrip().startswith(":root")  # CSS names its variables so
+                named += (
+                    [f"{path.name}: {node.value}"] if re.search(r"(^|\W)--[a-z]", node.value) and not styles else []
+                )
     assert [each for each in named if not each.startswith("process.py:  --")] == []

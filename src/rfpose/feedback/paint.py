@@ -28,7 +28,7 @@ from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.geometry import enu_from_wgs84
-from rfpose.scenario.paint import heliostat_place, key_of, origin_of, place_of, properties_of, read_object
+from rfpose.paint import heliostat_place, key_of, origin_of, place_of, properties_of, read_object
 from rfpose.sun import Site, unix_seconds
 
 __all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "heliostat_ids", "read_heliostat"]

@@ -230,8 +230,8 @@ def check_transmitters(transmitter_enu_m: npt.ArrayLike) -> FloatArray:
     n = len(np.unique(array, axis=0))  # several carriers of one antenna are one place
     if n < n_axis + 2:
         raise GeometryError(
-            f"`transmitter_enu_m` must hold {n_axis + 2} or more places to solve {n_axis} dimensions from range "
-            f"differences, got {n}; add transmitters"
+            f"`transmitter_enu_m` must hold {n_axis + 2} or more transmitters, at places of their own, to solve "
+            f"{n_axis} dimensions from range differences, got {n}; add transmitters"
         )
     singular = np.linalg.svd(array - array.mean(axis=0), compute_uv=False)
     if singular[1] <= 1e-9 * singular[0]:

@@ -14,9 +14,9 @@ from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.files import claim, write_atomically
 from rfpose.geometry import enu_from_azimuth_elevation
+from rfpose.paint import read_plan
 from rfpose.scenario import PositionForm, parse_scenario
 from rfpose.scenario.field_table import HeliostatTable
-from rfpose.scenario.paint import read_plan
 from rfpose.scenario.schema import scenario_schema_text
 
 __all__ = ["KINDS", "Starter", "starter_of_field", "starter_of_kind", "write_starter"]

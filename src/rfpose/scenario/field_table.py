@@ -11,8 +11,8 @@ from pydantic import Field, ValidationError, model_validator
 from rfpose.checks import FloatArray
 from rfpose.errors import RecordingError, ScenarioError
 from rfpose.foreign import beside
+from rfpose.paint import read_plan
 from rfpose.scenario._words import in_words
-from rfpose.scenario.paint import read_plan
 from rfpose.scenario.positions import PositionForm, read_positions
 
 __all__ = ["HeliostatTable", "add_listed"]

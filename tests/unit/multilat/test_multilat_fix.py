@@ -207,8 +207,8 @@ def test_no_rows_give_no_fixes():
 @pytest.mark.parametrize(
     ("transmitter", "match"),
     [
-        (TRANSMITTER[:4], "5 or more places"),
-        (np.concatenate([TRANSMITTER[:4], TRANSMITTER[:3]]), "5 or more places"),
+        (TRANSMITTER[:4], "5 or more transmitters"),
+        (np.concatenate([TRANSMITTER[:4], TRANSMITTER[:3]]), "5 or more transmitters"),
         (np.outer(np.arange(7.0), [1.0, 2.0, 3.0]), "one line"),
     ],
 )

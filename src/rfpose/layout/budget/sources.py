@@ -356,7 +356,7 @@ class Reflections:
     """Rays off neighbours, the tower and the mirror's own plate, foreseen from their geometry."""
 
     name = "reflections of the site"
-    remedy = "`rfpose process --pose site`, which has them in its model (`rfpose layout budget --pose site`)"
+    remedy = "pose `site`, which has them in its model; its own budget says what they cost then"
 
     def assumed(self, plan: Plan) -> str:
         return "" if plan.stray_m is None else "rays foreseen from outlines and [site.structures]"

@@ -222,8 +222,8 @@ def _refuse_blind(site: Scenario, found: ErrorBudget, studied: list[Posture]) ->
     name = site.heliostat_ids[heliostat]
     if found.pose == "site":
         raise ScenarioError(
-            f"heliostat `{name}` receives too little to be solved in posture `{studied[posture].name}`; `rfpose layout "
-            "map --estimator site` says of each mirror why"
+            f"heliostat `{name}` receives too little to be solved in posture `{studied[posture].name}`; a map by "
+            "estimator `site` says of each mirror why"
         )
     raise ScenarioError(
         f"the pose of heliostat `{name}` is not determined by its phases; add transmitters, a calibration "
