@@ -82,6 +82,35 @@ def _count_i16(flat, limit):
     return n_clip, n_fill
 
 
+@kernel
+def _inspect_segment_i16(part, limit):
+    """Return (clipped, fill, samples of a stretch that is all zero) of a short stretch of I and Q."""
+    lowest, highest = _extremes_i16(part)
+    if highest >= limit or lowest <= -limit:
+        clipped, fill = _count_i16(part, limit)
+        return clipped, fill, 0
+    if lowest == 0 and highest == 0:
+        return 0, 0, part.size // 2
+    return 0, 0, 0
+
+
+@kernel
+def _inspect_until_i16(flat, limit, segment, looked, end, found):
+    """Inspect segments from sample ``looked`` on until ``end`` is passed; return how far that is.
+
+    ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero.
+    """
+    n_sample = flat.size // 2
+    while looked < min(end, n_sample):
+        ahead = min(looked + segment, n_sample)
+        clipped, fill, zero = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
+        found[0] += clipped
+        found[1] += fill
+        found[2] += zero
+        looked = ahead
+    return looked
+
+
 @kernel_inline
 def _add_row_i16(x, a, c, re, im):
     """Add one row of samples turned by a + jc; ``a`` and ``c`` carry a factor 2⁻¹⁶.
@@ -122,9 +151,7 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
     n_fold = row_re.size
     period = ramp_re.size
     n_sample = pair.size
-    clipped = 0
-    fill = 0
-    zero = 0
+    found = np.zeros(3, np.int64)
     looked = n_seen
     for k in range(n_block):
         for j in range(2 * period):
@@ -134,13 +161,7 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
         for r in range(0, n_fold, 2):
             first = (k * n_fold + r) * period
             end = first + 2 * period
-            while looked < min(end, n_sample):
-                ahead = min(looked + segment, n_sample)
-                c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-                clipped += c
-                fill += f
-                zero += z
-                looked = ahead
+            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
             if r + 1 < n_fold and end <= n_sample:
                 x = pair[first : first + period]
                 after = pair[first + period : end]
@@ -153,14 +174,8 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
             turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
             im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
             re[j] = turned
-    while looked < n_sample:
-        ahead = min(looked + segment, n_sample)
-        c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-        clipped += c
-        fill += f
-        zero += z
-        looked = ahead
-    return clipped, fill, zero
+    _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
+    return found[0], found[1], found[2]
 
 
 @kernel_inline
@@ -231,9 +246,7 @@ def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
     on_re = (row_re[n_half] * row_re[0] + row_im[n_half] * row_im[0]) * scale
     on_im = (row_im[n_half] * row_re[0] - row_re[n_half] * row_im[0]) * scale
     two = np.empty((2, 6, period), np.float32)
-    clipped = 0
-    fill = 0
-    zero = 0
+    found = np.zeros(3, np.int64)
     looked = n_seen
     for s in range(n_block + 1):
         now = two[s % 2]
@@ -241,13 +254,7 @@ def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
         for r in range(0, n_half, 2):
             first = (s * n_half + r) * period
             end = first + 2 * period
-            while looked < min(end, n_sample):
-                ahead = min(looked + segment, n_sample)
-                c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-                clipped += c
-                fill += f
-                zero += z
-                looked = ahead
+            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
             x = pair[first : first + period]
             if r + 1 < n_half:
                 _add_two_hann_rows_i16(
@@ -281,14 +288,8 @@ def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
             im += within_sin[j] * (before[5, j] - sin_im) - within_cos[j] * (before[3, j] - cos_im)
             out[s - 1, j] = re * ramp_re[j] - im * ramp_im[j]
             out[s - 1, period + j] = re * ramp_im[j] + im * ramp_re[j]
-    while looked < n_sample:
-        ahead = min(looked + segment, n_sample)
-        c, f, z = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-        clipped += c
-        fill += f
-        zero += z
-        looked = ahead
-    return clipped, fill, zero
+    _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
+    return found[0], found[1], found[2]
 
 
 @kernel_fast
@@ -308,29 +309,11 @@ def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
 
 
 @kernel
-def _inspect_segment_i16(part, limit):
-    """Return (clipped, fill, samples of a stretch that is all zero) of a short stretch of I and Q."""
-    lowest, highest = _extremes_i16(part)
-    if highest >= limit or lowest <= -limit:
-        clipped, fill = _count_i16(part, limit)
-        return clipped, fill, 0
-    if lowest == 0 and highest == 0:
-        return 0, 0, part.size // 2
-    return 0, 0, 0
-
-
-@kernel
 def inspect_i16(flat, limit, segment):
     """Return (clipped, fill, samples in all-zero segments); ``limit`` is full scale in counts."""
-    clipped = 0
-    fill = 0
-    zero = 0
-    for first in range(0, flat.size, 2 * segment):
-        c, f, z = _inspect_segment_i16(flat[first : min(first + 2 * segment, flat.size)], limit)
-        clipped += c
-        fill += f
-        zero += z
-    return clipped, fill, zero
+    found = np.zeros(3, np.int64)
+    _inspect_until_i16(flat, limit, segment, 0, flat.size // 2, found)
+    return found[0], found[1], found[2]
 
 
 @kernel

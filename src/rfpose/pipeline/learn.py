@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +21,12 @@ from rfpose.pipeline.formats.mount_file import MountFile, read_models
 from rfpose.pipeline.formats.survey_file import SurveyFile, read_survey
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.frames import Frames, commanded_in, measured_frames
+from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, listed
 from rfpose.pipeline.site.mounts import normals_by_mounts, planned_mounts
 from rfpose.pipeline.site.poses import rotations
 from rfpose.propagation import RayKind
 from rfpose.recording import Recording
-from rfpose.scenario import Scenario, scenario_of
+from rfpose.scenario import Scenario
 
 __all__ = ["learn_from_frames", "learn_pattern"]
 
@@ -40,7 +40,7 @@ _FEWEST = 10
 
 
 def learn_pattern(
-    recordings: Sequence[Recording | str | Path] | Recording | str | Path,
+    recordings: Recordings,
     output: str | Path | None = None,
     *,
     scenario: Scenario | str | Path | None = None,
@@ -84,18 +84,11 @@ def learn_pattern(
     InvalidInputError
         No recording, too few postures, or what was learned did not come to rest: nothing is written.
     """
-    many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
-    if not many:
-        raise InvalidInputError("`recordings` must name one recording or more")
+    many = listed(recordings)
     read = [r for r in many if not isinstance(r, Recording)]
     files = [f for f in (scenario, start, survey, mounts) if isinstance(f, str | Path)]
     with claim(output, inputs=[*read, *files], force=force):
-        site = None if scenario is None else scenario_of(scenario)
-        parts = []
-        for recording in many:
-            part, site = measured_frames(recording, site, follow_links=follow_links)
-            parts.append(part)
-        assert site is not None
+        parts, site = frames_of(many, scenario, follow_links=follow_links)
         surveyed = read_survey(survey) if isinstance(survey, str | Path) else survey
         given = read_models(mounts) if isinstance(mounts, str | Path) else mounts
         found = learn_from_frames(parts, site, start=start, survey=surveyed, mounts=given, on_progress=on_progress)

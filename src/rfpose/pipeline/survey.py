@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,17 +28,17 @@ from rfpose.pipeline.formats.survey_file import SurveyedMounts, SurveyFile, writ
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.postures import read_postures
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.frames import Frames, commanded_in, measured_frames
+from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, listed
 from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts, surveyed_mounts
 from rfpose.pipeline.site.poses import knowledge_of, rotations, settings_of, wavenumbers_of
 from rfpose.recording import Recording
-from rfpose.scenario import Scenario, scenario_of
+from rfpose.scenario import Scenario
 
 __all__ = ["Besides", "Frames", "survey", "survey_frames"]
 
 
 def survey(
-    recordings: Sequence[Recording | str | Path] | Recording | str | Path,
+    recordings: Recordings,
     output: str | Path | None = None,
     *,
     scenario: Scenario | str | Path | None = None,
@@ -100,9 +100,7 @@ def survey(
     >>> found.undetermined[0][0]
     'rotation of the receivers against the plate about x'
     """
-    many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
-    if not many:
-        raise InvalidInputError("`recordings` must name one recording or more")
+    many = listed(recordings)
     if not reference_sigma_rad > 0.0:
         raise InvalidInputError(f"`reference_sigma_rad` must be greater than zero, got {reference_sigma_rad}")
     if motors is not None and mounts is None:
@@ -110,12 +108,7 @@ def survey(
     read = [r for r in many if not isinstance(r, Recording)]
     files = [f for f in (scenario, reference, mounts, motors) if isinstance(f, str | Path)]
     with claim(output, inputs=[*read, *files], force=force):
-        site = None if scenario is None else scenario_of(scenario)
-        parts = []
-        for recording in many:
-            part, site = measured_frames(recording, site, follow_links=follow_links)
-            parts.append(part)
-        assert site is not None
+        parts, site = frames_of(many, scenario, follow_links=follow_links)
         besides = Besides.read(site, parts, reference, reference_sigma_rad, mounts, motors)
         found = survey_frames(parts, site, besides, on_progress=on_progress)
         if output is not None:

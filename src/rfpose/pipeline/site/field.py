@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -159,11 +161,12 @@ def antenna_of(scenario: Scenario) -> ReceivingAntenna:
     """
     table = scenario.antenna
     if table.pattern is not None:
-        pattern = read_pattern(table.pattern).pattern
+        path, version = str(table.pattern), _version_of(table.pattern)
+        pattern = _pattern(path, version)
         try:
             for heliostat in scenario.heliostat:
                 pattern.check_receivers(heliostat.receiver_mirror_m)
-            return PatternAntenna.of(pattern, scenario.carrier_rf_hz, holds_own_plate=True)
+            return _antenna(path, version, tuple(scenario.carrier_rf_hz.tolist()))
         except InvalidInputError as error:
             raise ScenarioError(f"{table.pattern}, scenario `{scenario.name}`: {error}") from error
     if table.receiver == "dipole":
@@ -189,6 +192,26 @@ def foresight_of(scenario: Scenario, *, own_plate: bool) -> Foresight:
         antenna=scenario.antenna.transmitter,
         propagation_speed_mps=scenario.radio.propagation_speed_mps,
     )
+
+
+def _version_of(path: str | Path) -> tuple[int, int] | None:
+    """Tell one content of a file from another; None where there is none, of which its reader says so."""
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+# studies of a site ask for the same pattern again and again
+@functools.lru_cache(maxsize=4)
+def _pattern(path: str, version: tuple[int, int] | None) -> AntennaPattern:
+    return read_pattern(path).pattern
+
+
+@functools.lru_cache(maxsize=4)
+def _antenna(path: str, version: tuple[int, int] | None, carrier_rf_hz: tuple[float, ...]) -> PatternAntenna:
+    return PatternAntenna.of(_pattern(path, version), np.array(carrier_rf_hz), holds_own_plate=True)
 
 
 class SiteField:

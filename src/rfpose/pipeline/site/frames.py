@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -11,14 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.errors import ScenarioError
+from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.pipeline.measure import measure_tones
 from rfpose.pipeline.postures import commanded_normals
 from rfpose.pipeline.site.poses import check_site_solvable
 from rfpose.recording import Recording, check_against, frame_starts, open_recording
-from rfpose.scenario import Scenario
+from rfpose.scenario import Scenario, scenario_of
 
-__all__ = ["Frames", "commanded_in", "measured_frames"]
+__all__ = ["Frames", "Recordings", "commanded_in", "frames_of", "listed", "measured_frames"]
+
+Recordings = Recording | str | Path | Sequence[Recording | str | Path]
+"""One, or several of one site."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +43,44 @@ class Frames:
     sigma: FloatArray
     unix_s: FloatArray
     simulated: bool = False
+
+
+def listed(recordings: Recordings) -> list[Recording | str | Path]:
+    """Return recordings of which one may stand by itself.
+
+    Raises
+    ------
+    InvalidInputError
+        None at all.
+    """
+    many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    if not many:
+        raise InvalidInputError("`recordings` must name one recording or more")
+    return many
+
+
+def frames_of(
+    recordings: Sequence[Recording | str | Path], scenario: Scenario | str | Path | None, *, follow_links: bool
+) -> tuple[list[Frames], Scenario]:
+    """Measure the carriers of recordings of one site: that given, or the first recording's own.
+
+    Parameters
+    ----------
+    recordings, scenario, follow_links
+        As `measured_frames`, for each recording.
+
+    Raises
+    ------
+    RecordingError, ScenarioError
+        As `measured_frames`.
+    """
+    site = None if scenario is None else scenario_of(scenario)
+    parts = []
+    for recording in recordings:
+        part, site = measured_frames(recording, site, follow_links=follow_links)
+        parts.append(part)
+    assert site is not None  # there is a recording, and it was refused without one
+    return parts, site
 
 
 def measured_frames(
