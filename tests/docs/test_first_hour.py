@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
-
-import pytest
 
 from docs.transcript import run, same, steps, write_files
 
@@ -19,8 +16,6 @@ def test_ten_commands_lead_from_a_table_to_a_report(tmp_path: Path) -> None:
     found = steps(PAGE)
     assert len(found) == 10
     for step in found:
-        if step.command.startswith("rfpose view") and importlib.util.find_spec("PySide6") is None:
-            pytest.skip("the last two commands need the extra `gui`")
         printed = run(step.command, tmp_path)
         assert same(step.shown, printed), f"{step.command} printed:\n{printed}"
     made = {"site.png", "map.png", "budget.png", "poses.csv", "field.png", "report.html"}

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import re
 import shlex
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -52,23 +50,15 @@ def write_files(page: Path, folder: Path) -> None:
 def run(command: str, folder: Path) -> str:
     """Run a command as in a shell and return what it prints; notes and progress are left out.
 
-    In this process, which spares loading all anew; but the viewer, whose Qt wants one of its own.
+    In this process, which spares loading all anew.
     """
     program, *words = shlex.split(command)
     assert program == "rfpose", command
-    environment = {"QT_QPA_PLATFORM": "offscreen", "COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"}
-    if words[0] == "view":
-        line = [sys.executable, "-c", "from rfpose.cli import main; main()", *words]
-        done = subprocess.run(
-            line, capture_output=True, text=True, cwd=folder, env=os.environ | environment, check=False
-        )
-        code, printed, said = done.returncode, done.stdout, done.stderr
-    else:
-        with contextlib.chdir(folder):
-            shown = CliRunner().invoke(app, words, env=environment)
-        code, printed, said = shown.exit_code, shown.stdout, shown.stderr
-    assert code == 0, f"{command}: {said}"
-    return "".join(f"{line.rstrip()}\n" for line in printed.splitlines())
+    environment = {"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"}
+    with contextlib.chdir(folder):
+        shown = CliRunner().invoke(app, words, env=environment)
+    assert shown.exit_code == 0, f"{command}: {shown.stderr}"
+    return "".join(f"{line.rstrip()}\n" for line in shown.stdout.splitlines())
 
 
 def same(shown: str, printed: str, *, rel: float = 0.05) -> bool:

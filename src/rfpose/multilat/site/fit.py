@@ -327,7 +327,7 @@ def fit_site(
     """
     chosen = settings or SiteSettings()
     fit = Fit(observations, knowledge, chosen)
-    known, everyone, some = who(knowledge)
+    known, everyone, some = known_mirrors(knowledge)
     common, state, before = given_common(chosen), State.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, some, common), some, common)
@@ -364,7 +364,7 @@ def given_common(settings: SiteSettings) -> Common:
     )
 
 
-def who(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
+def known_mirrors(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArray]:
     """Return which mirrors can be begun with, the same as rows, and rows spread over them from which all learn."""
     known = np.asarray(
         np.isfinite(knowledge.commanded_rot).all(axis=(1, 2)) & np.isfinite(knowledge.pivot_enu_m).all(axis=1)
@@ -498,7 +498,7 @@ class Fit:
             np.ascontiguousarray(observations.sigma, np.float64),
             np.ascontiguousarray(observations.wavenumber_radpm, np.float64),
             np.ascontiguousarray(knowledge.unit_field, np.float64),
-            alike(observations.wavenumber_radpm, knowledge.mast, settings.detour_m).sum(axis=1),
+            carrier_likeness(observations.wavenumber_radpm, knowledge.mast, settings.detour_m).sum(axis=1),
         )
         with np.errstate(divide="ignore"):
             pivot_info, roll_info, clock_info = (
@@ -630,7 +630,7 @@ class Fit:
         return replace(poses, protection_level_rad=np.where(lost, np.nan, level))
 
 
-def alike(wavenumber_radpm: FloatArray, mast: IntArray | None, detour_m: float) -> FloatArray:
+def carrier_likeness(wavenumber_radpm: FloatArray, mast: IntArray | None, detour_m: float) -> FloatArray:
     """(transmitter, transmitter) how far carriers of one antenna hear the same of what nothing foresees, 0 to 1.
 
     The correlation of a ray of random phase and exponentially distributed detour.

@@ -27,11 +27,11 @@ from rfpose.multilat.site.fit import (
     State,
     Told,
     Voltages,
-    alike,
+    carrier_likeness,
     field_of,
     given_common,
+    known_mirrors,
     roll_sigma_rad_of,
-    who,
 )
 from rfpose.propagation import RayKind
 
@@ -153,7 +153,7 @@ class ForeseenMirrors:
             Arrays that do not fit each other.
         """
         chosen = settings or SiteSettings()
-        known, everyone, some = who(knowledge)
+        known, everyone, some = known_mirrors(knowledge)
         common = given_common(chosen)
         voltages = field_of(field_at, State.begin(knowledge), everyone, common)
         link = np.repeat(np.arange(len(voltages.rays.first) - 1), np.diff(voltages.rays.first))
@@ -168,7 +168,7 @@ class ForeseenMirrors:
     def poses(self) -> SitePoses:
         """Return what the fit would state."""
         fit = self._fit(self.received())
-        known, everyone, _ = who(self.knowledge)
+        known, everyone, _ = known_mirrors(self.knowledge)
         # one step from the truth: residuals are zero, so that links keep the weight that they have on average
         state = fit.run(fit.prepare(self.voltages), State.begin(self.knowledge), everyone, self.common)
         return fit.outcome(state, known, self.common)
@@ -211,7 +211,7 @@ class ForeseenMirrors:
             Take one step only, which is right for a small disturbance.
         """
         known, off = self.knowledge, disturbance
-        _, everyone, _ = who(known)
+        _, everyone, _ = known_mirrors(known)
         told = replace(
             known,
             pivot_enu_m=known.pivot_enu_m + off.pivot_m,
@@ -307,7 +307,7 @@ def _draw_floor(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> D
     shape, nu = mirrors.sigma.shape, mirrors.common.tail
     heavy = np.sqrt(nu / rng.chisquare(nu, shape))
     strength = mirrors.common.floor * mirrors.knowledge.unit_field[:, None]
-    together = alike(mirrors.wavenumber_radpm, mirrors.knowledge.mast, mirrors.settings.detour_m)
+    together = carrier_likeness(mirrors.wavenumber_radpm, mirrors.knowledge.mast, mirrors.settings.detour_m)
     drawn = _complex(rng, shape) @ np.linalg.cholesky(together + 1e-9 * np.eye(shape[2])).T
     return Disturbance(stray=np.asarray(strength * heavy * drawn, np.complex128))
 

@@ -33,7 +33,7 @@ from rfpose.multilat.site.fit import (
     SitePoses,
     SiteSettings,
     Voltages,
-    alike,
+    carrier_likeness,
     fit_site,
     heard_by,
 )
@@ -544,7 +544,7 @@ class _Linear:
         self._heavy = (nu + 3.0) / (nu + 1.0)
         """How much more variance links have than their weights say: expected information of Student's t."""
         wave = system.seen.wavenumber_radpm
-        self._crowd = alike(wave, system.known.mast, settings.detour_m).sum(axis=1)
+        self._crowd = carrier_likeness(wave, system.known.mast, settings.detour_m).sum(axis=1)
 
     def reduced(self, row: int, rows: _Rows, worth: float) -> FloatArray:
         """Return rows (link, constant + 1) of a frame that counts so much, pose and phases taken out."""
