@@ -8,7 +8,7 @@ at the true pose.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,15 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.layout.budget.sources import Misalignment, Motion, ReceiverPlaces, Thermal, TransmitterSurvey, Wavelength
+from rfpose.layout.budget.sources import (
+    Misalignment,
+    Motion,
+    Quantisation,
+    ReceiverPlaces,
+    Thermal,
+    TransmitterSurvey,
+    Wavelength,
+)
 from rfpose.layout.budget.table import ErrorBudget, budget_line, target_slope, worst_first
 from rfpose.layout.maps import Mirrors
 from rfpose.multilat.site import Disturbance, ForeseenMirrors
@@ -226,31 +234,23 @@ def _clock(plan: SitePlan) -> str:
 # -- what it does not reckon with --------------------------------------------------------------------------------------
 
 
-def _quantisation(plan: SitePlan) -> str:
-    simulated = plan.scenario.simulation
-    if plan.converter_share == 0.0:
-        return ""
-    return f"{simulated.adc_bits} bits, {simulated.headroom_db:g} dB headroom"
-
-
 def _draw_quantisation(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
     drawn = part.drawn("noise", rng)
     return Disturbance(stray=np.sqrt(plan.converter_share) * drawn.stray)
 
 
-def _outer(columns: Sequence[FloatArray]) -> FloatArray:
-    """(mirror, xyz, xyz) sum of squares of changes (mirror, xyz)."""
-    return np.asarray(np.sum([c[:, :, None] * c[:, None, :] for c in columns], axis=0))
+def _through(part: ForeseenMirrors, worlds: Iterable[Disturbance], times: float) -> FloatArray:
+    """(mirror, xyz, xyz) sum of squares of what small disturbances do, each so many times as large."""
+    change = times * np.array([part.normal_change(world, linear=True) for world in worlds])
+    return np.asarray(np.einsum("dmx,dmy->mxy", change, change))
 
 
 def _share_places(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
-    sigma, columns = plan.scenario.budget.receiver_mirror_sigma_m, []
-    for receiver in range(part.sigma.shape[1]):
-        for axis in range(3):
-            place = np.zeros((*part.sigma.shape[:2], 3))
-            place[:, receiver, axis] = _STEP_M
-            columns.append(sigma / _STEP_M * part.normal_change(Disturbance(place_m=place), linear=True))
-    return _outer(columns)
+    _, n_receiver, _ = part.sigma.shape
+    steps = _STEP_M * np.eye(3 * n_receiver).reshape(-1, n_receiver, 3)
+    return _through(
+        part, (Disturbance(place_m=step) for step in steps), plan.scenario.budget.receiver_mirror_sigma_m / _STEP_M
+    )
 
 
 def _draw_places(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
@@ -259,13 +259,10 @@ def _draw_places(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator
 
 
 def _share_transmitters(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
-    sigma, columns = plan.scenario.budget.transmitter_survey_sigma_m, []
-    for transmitter in range(part.sigma.shape[2]):
-        for axis in range(3):
-            shift = np.zeros((part.sigma.shape[2], 3))
-            shift[transmitter, axis] = _STEP_M
-            columns.append(sigma / _STEP_M * part.normal_change(Disturbance(transmitter_m=shift), linear=True))
-    return _outer(columns)
+    n_transmitter = part.sigma.shape[2]
+    steps = _STEP_M * np.eye(3 * n_transmitter).reshape(-1, n_transmitter, 3)
+    sigma_m = plan.scenario.budget.transmitter_survey_sigma_m
+    return _through(part, (Disturbance(transmitter_m=step) for step in steps), sigma_m / _STEP_M)
 
 
 def _draw_transmitters(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
@@ -274,8 +271,7 @@ def _draw_transmitters(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Gen
 
 
 def _share_air(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
-    by_share = part.normal_change(Disturbance(range_scale=_STEP_SHARE), linear=True) / _STEP_SHARE
-    return _outer([Wavelength().sigma(plan) * by_share])
+    return _through(part, [Disturbance(range_scale=_STEP_SHARE)], Wavelength().sigma(plan) / _STEP_SHARE)
 
 
 def _draw_air(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
@@ -331,7 +327,7 @@ _LINES: tuple[_Line, ...] = (
     _reckoned("roll", "mount", _roll, "more transmitters, so that carriers tell all of the pose"),
     _reckoned("clock", "clock", _clock, "measure the delays between a mirror's receivers"),
     _Line(
-        name="quantisation", remedy="more converter bits, less headroom, longer frames", assumed=_quantisation,
+        name=Quantisation.name, remedy=Quantisation.remedy, assumed=Quantisation().assumed,
         share=lambda plan, part: plan.converter_share * part.share("noise"), draw=_draw_quantisation,
     ),
     _Line(

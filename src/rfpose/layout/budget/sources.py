@@ -45,6 +45,10 @@ class Described(Protocol):
     def scenario(self) -> Scenario:
         """The site."""
 
+    @property
+    def converter_share(self) -> float:
+        """Variance of rounding over that of thermal noise."""
+
 
 class Source(Protocol):
     """One line of the budget."""
@@ -105,7 +109,7 @@ class Quantisation:
     name = "quantisation"
     remedy = "more converter bits, less headroom, longer frames"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: Described) -> str:
         if plan.converter_share == 0.0:
             return ""
         return f"{plan.scenario.simulation.adc_bits} bits, {plan.scenario.simulation.headroom_db:g} dB headroom"

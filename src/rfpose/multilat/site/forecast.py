@@ -74,7 +74,7 @@ class Disturbance:
 
     Attributes
     ----------
-    place_m : (mirror, receiver, xyz)
+    place_m : (mirror, receiver, xyz) or (receiver, xyz)
         Receivers beside where they are taken to be, in the mirror frame [m].
     transmitter_m : (transmitter, xyz)
         [m].
