@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import rfpose as rf
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout.maps import check_site, disc_points, mirrors_facing
 from rfpose.layout.optimise import (
@@ -16,6 +17,7 @@ from rfpose.layout.optimise import (
     measured,
     optimise,
 )
+from rfpose.pipeline.layout import Rules
 
 TRIANGLE = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
 FIELD = mirrors_facing(disc_points(100), TRIANGLE, normal_enu=[0.0, -0.5, 1.0])
@@ -214,3 +216,34 @@ def test_search_keeps_new_towers_out_of_lines_of_sight() -> None:
     assert sight.crossed(bare.transmitter_enu_m) > 0
     assert sight.margin(kept.transmitter_enu_m)[0].min() > -1e-5
     assert kept.value >= bare.value * 0.999
+
+
+def test_above_its_top_an_excluded_place_is_free():
+    zone = Zone(corner_enu_m=np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]), top_m=10.0)
+    place = np.array([[2.0, 1.0, 3.0], [2.0, 1.0, 9.5], [2.0, 1.0, 12.0], [5.0, 1.0, 3.0]])
+    depth, slope = zone.inside(place)
+    assert depth == pytest.approx([1.0, 0.5, -2.0, -1.0])
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        np.testing.assert_allclose((zone.inside(place + step)[0] - depth) / 1e-6, slope[:, axis], atol=1e-6)
+
+
+def test_no_tower_is_placed_inside_a_building():
+    site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    wanted = rf.optimise(site, starts=2).scenario.transmitter_enu_m
+    boxes = [
+        {
+            "id": f"box{k}",
+            "base_enu_m": (*place[:2], 0.0),
+            "size_m": (6.0, 9.0, float(place[2]) + 1.0),
+            "azimuth_deg": 30,
+        }
+        for k, place in enumerate(wanted[:3])
+    ]
+    built = site.changed(transmitter=[
+        {**t.model_dump(exclude_none=True), "position_enu_m": (1.3 * t.position_enu_m[0], *t.position_enu_m[1:])}
+        for t in site.transmitter
+    ], site={"structures": {"box": boxes}})  # fmt: skip
+    found = rf.optimise(built, starts=2, rules=Rules(radius_m=100.0, height_m=(20.0, 50.0))).scenario
+    assert not any(box.holds(t.position_enu_m) for box in found.site.structures.box for t in found.transmitter)
+    assert all(box.holds(tuple(place)) for box, place in zip(found.site.structures.box, wanted[:3], strict=True))

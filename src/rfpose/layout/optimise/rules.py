@@ -22,11 +22,14 @@ class Zone:
         Polygon, any direction, not closed [m].
     centre_enu_m, radius_m
         Circle [m].
+    top_m
+        Where it is excluded, only what is not above this [m].
     """
 
     corner_enu_m: FloatArray | None = None
     centre_enu_m: tuple[float, float] = (0.0, 0.0)
     radius_m: float = np.nan
+    top_m: float = np.inf
 
     def __post_init__(self) -> None:
         if self.corner_enu_m is None:
@@ -54,6 +57,14 @@ class Zone:
             x = start[:, 0] + (point[:, 1:] - start[:, 1]) / edge[:, 1] * edge[:, 0]
         inside = np.where((crosses & (point[:, :1] < x)).sum(axis=1) % 2 == 1, 1.0, -1.0)
         return inside * distance, inside[:, None] * gap / np.maximum(distance, 1e-12)[:, None]
+
+    def inside(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how deep each place (place, xyz) lies inside or below [m] (negative: not), and its slope."""
+        depth, by = self.depth(place[:, :2])
+        below = self.top_m - place[:, 2]
+        over = below < depth
+        slope = np.concatenate([np.where(over[:, None], 0.0, by), np.where(over, -1.0, 0.0)[:, None]], axis=1)
+        return np.where(over, below, depth), slope
 
     @property
     def box(self) -> tuple[FloatArray, FloatArray]:

@@ -106,7 +106,7 @@ class Problem:
         rules, ground = self.constraints, place[:, :2]
         free: npt.NDArray[np.bool_] = np.any([zone.depth(ground)[0] >= 0.0 for zone in rules.allowed], axis=0)
         for zone in rules.excluded:
-            free &= zone.depth(ground)[0] <= 0.0
+            free &= zone.inside(place)[0] <= 0.0
         if self.heliostats is not None:
             free &= np.asarray(self.heliostats.query(ground)[0]) >= rules.clearance_m
         if rules.sight is not None:
@@ -133,7 +133,7 @@ class Problem:
 
         def each(depth: FloatArray, by: FloatArray) -> None:
             rows = np.zeros((n, n, 3))
-            rows[np.arange(n), np.arange(n), :2] = by
+            rows[np.arange(n), np.arange(n), : by.shape[1]] = by
             value.append(depth / self.scale)
             slope.append(rows.reshape(n, -1))
 
@@ -144,18 +144,14 @@ class Problem:
             np.array([inside[k][1][i] for i, k in enumerate(best)]),
         )
         for zone in rules.excluded:
-            depth, by = zone.depth(ground)
+            depth, by = zone.inside(self.scale * new)
             each(-depth, -by)
         if rules.clearance_m > 0.0 and self.heliostats is not None:
             distance, nearest = (np.asarray(a) for a in self.heliostats.query(ground))
             offset = ground - self.heliostats.data[nearest]
             each(distance - rules.clearance_m, offset / np.maximum(distance, 1e-12)[:, None])
         if rules.sight is not None:
-            depth, by = rules.sight.margin(self.scale * new)
-            rows = np.zeros((n, n, 3))
-            rows[np.arange(n), np.arange(n)] = by
-            value.append(depth / self.scale)
-            slope.append(rows.reshape(n, -1))
+            each(*rules.sight.margin(self.scale * new))
         if rules.separation_m > 0.0:
             others = np.vstack([ground, self.existing[:, :2]])
             i, j = np.triu_indices(len(others), 1)

@@ -42,7 +42,7 @@ from rfpose.pipeline.layout.site import (
 from rfpose.pipeline.layout.text import edited
 from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
 from rfpose.pipeline.site import check_site_solvable, forecast_normals
-from rfpose.scenario import Heliostat, PositionForm, Scenario, naming, read_positions
+from rfpose.scenario import Box, Heliostat, PositionForm, Scenario, naming, read_positions
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
 
@@ -115,13 +115,27 @@ class Rules:
         return Constraints(
             allowed=(ground, *(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.allowed_m)),
             height_m=heights if self.height_m is None else self.height_m,
-            excluded=tuple(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.excluded_m),
+            excluded=(
+                *(Zone(centre_enu_m=(x, y), radius_m=r) for x, y, r in self.excluded_m),
+                *(_around(box) for box in scenario.site.structures.box),
+            ),
             separation_m=_SEPARATION * radius if self.separation_m is None else self.separation_m,
             clearance_m=self.clearance_m,
             sight=sightlines(scenario, self.sight_m),
         )
 
 
+def _around(box: Box) -> Zone:
+    """Return the ground of a tower or building; antennas may stand on top."""
+    half = 0.5 * np.array(box.size_m[:2]) + _BESIDE_M
+    angle = np.radians(box.azimuth_deg)
+    rot = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    corner = half * [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]] @ rot
+    return Zone(corner_enu_m=corner + np.array(box.base_enu_m[:2]), top_m=box.base_enu_m[2] + box.size_m[2] + _BESIDE_M)
+
+
+_BESIDE_M = 0.1
+"""Between a building and an antenna: more than places are rounded by."""
 _MAST_M = 0.5
 """What a mast needs beside a mirror's light."""
 
