@@ -22,6 +22,7 @@ from rfpose.pipeline.formats.result_file import open_result
 from rfpose.recording import open_recording
 from rfpose.recording.base import RecordingFormat
 from rfpose.scenario import Scenario, load_scenario
+from told import undocumented, unseen
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -210,6 +211,8 @@ def test_demo_makes_its_directory_and_all_it_promises(tmp_path: Path) -> None:
     assert {Path(path).name for path in told["files"].values()} == names
     assert all(Path(path).is_file() for path in told["files"].values())
     assert told["solved"] == 60
+    assert not undocumented("demo", [told])
+    assert not unseen("demo", [told])
     (tmp_path / "new" / "demo" / "recording.h5").unlink()  # 300 MB
 
 

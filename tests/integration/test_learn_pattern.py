@@ -19,6 +19,7 @@ from rfpose.pipeline.learn import learn_from_frames
 from rfpose.pipeline.postures import commanded_normals
 from rfpose.pipeline.site.frames import measured_frames
 from rfpose.pipeline.survey import Besides, survey_frames
+from told import undocumented, unseen
 
 RF_HZ = 433e6
 SPEED = 299_792_458.0
@@ -180,6 +181,8 @@ def test_the_command_writes_and_reports(lessons, folder):
     report = json.loads(run.stdout)
     assert (report["postures"], report["settled"], len(report["unheard"])) == (48, True, 3)
     assert report["explained"] > 0.8
+    assert not undocumented("antenna learn", [report])
+    assert not unseen("antenna learn", [report])
     again = CliRunner().invoke(app, [*words, str(folder / "one.h5")])
     assert again.exit_code == 3
     assert "exists already" in again.output
