@@ -18,8 +18,8 @@ _HEAD = """\
 # Commands and options
 
 Made from the commands by `python -m rfpose.cli._reference > docs/command-reference.md`. What all commands have in
-common, and what they print with `--json`, stands in [command-line.md](command-line.md). Every command has `--help`,
-`--json` and `--debug` besides.
+common stands in [command-line.md](command-line.md), what they print with `--json` in [json-output.md](json-output.md).
+Every command has `--help`, `--json` and `--debug` besides.
 """
 _BAR = " \\| "
 _COMMON = ("json", "debug", "help")
