@@ -20,6 +20,7 @@ from PySide6.QtGui import QImage
 from rfpose.cli import _app, plot
 from rfpose.cli import view as command
 from rfpose.errors import RecordingError, RfposeError, install_remedy
+from rfpose.multilat import PoseStatus
 from rfpose.pipeline.pictures.catalogue import FIGURES
 from rfpose.pipeline.pictures.results import COLOURS
 from rfpose.recording import open_recording
@@ -142,6 +143,53 @@ def test_figures_of_a_report_are_those_of_the_commands(files: dict[str, Path], t
     # the bound of the layout: of the first frame, the same solver
     mapped = json_of("layout", "map", files["scenario"], "--estimator", "scenario")["normal_mrad"]["scenario"]["rms"]
     assert mapped == pytest.approx(printed["evaluate"]["bound_mrad"]["rms"], rel=0.1)
+
+
+def cells(table: Any) -> list[list[str]]:
+    return [[table.item(i, j).text() for j in range(table.columnCount())] for i in range(table.rowCount())]
+
+
+def test_levels_of_the_recording_view_are_those_of_the_command(qapp, files: dict[str, Path]) -> None:
+    told = json_of("info", files["recording"])
+    _, window = export.open_window(files["recording"])
+    export.settle(qapp, window)
+    shown = cells(window.views["recording"].receiver_table)
+    assert [row[0] for row in shown] == list(told["receivers"])
+    for name, level, clipped, _, lost, blocks in shown:
+        receiver = told["receivers"][name]
+        assert level == f"{receiver['rms_dbfs']:.1f}"
+        assert clipped == f"{100.0 * receiver['clipped_fraction']:.3g} %"
+        assert lost == str(receiver["lost_samples"])
+        assert blocks == str(receiver["blocks"])
+    window.close()
+
+
+def test_mirrors_of_the_field_view_have_the_numbers_of_the_commands(
+    qapp, files: dict[str, Path], tmp_path: Path
+) -> None:
+    evaluated = json_of("evaluate", files["result"])
+    processed = json_of("process", files["recording"], "-o", tmp_path / "again.h5")
+    _, window = export.open_window(files["result"])
+    view, field = window.views["field"], window.session.document.field
+    excluded: dict[str, int] = {}
+    for k, told in enumerate(evaluated["heliostats"]):
+        sigma = []
+        for frame in range(field.n_frame):
+            window.session.select(heliostat=k, frame=frame)
+            export.settle(qapp, window)
+            headline = view.headline.text()
+            assert headline.startswith(f"<b>{told['id']}</b>")
+            sigma.append(float(re.search(r"sigma (\S+) mrad", headline)[1]))
+        assert np.isfinite(sigma).sum() == told["solved"]
+        assert np.sqrt(np.nanmean(np.square(sigma))) == pytest.approx(told["sigma_mrad"]["rms"], rel=2e-3)
+        across, up = (1e3 * curve.getData()[1] for curve in view.offset_curves)
+        assert np.sqrt(np.mean(across**2 + up**2)) == pytest.approx(told["normal_error_mrad"]["rms"], rel=1e-6)
+        for transmitter, reason, count in cells(view.excluded):
+            if reason in str(processed["integrity"]["excluded"]):
+                excluded[transmitter] = excluded.get(transmitter, 0) + int(count.split()[0])
+    assert (field.status == PoseStatus.OK).sum() == processed["poses"]["solved"] == evaluated["solved"]
+    assert excluded == {k: sum(v.values()) for k, v in processed["integrity"]["excluded"].items()}
+    window.close()
 
 
 def test_svg_holds_text_that_can_be_read(files: dict[str, Path], tmp_path: Path) -> None:

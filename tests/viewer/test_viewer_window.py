@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -525,6 +526,27 @@ def test_error_in_work_becomes_a_message(window: MainWindow, qtbot, error: Excep
     assert message in window.session.message.text
     qtbot.keyClick(window, Qt.Key.Key_Escape)
     assert window.session.message is None
+
+
+@pytest.mark.parametrize(("name", "after_s"), [("Thing", 0.0), ("Map", 1.0)])
+def test_work_that_lasts_shows_how_far_it_is(window: MainWindow, qtbot, name: str, after_s: float) -> None:
+    go_on, end = threading.Event(), threading.Event()
+
+    def work(on_progress: Callable[[int, int], None]) -> None:
+        go_on.wait(10.0)
+        on_progress(3, 8)
+        end.wait(10.0)
+
+    window.show()
+    begun = time.monotonic()
+    window.workers.run(name, work, lambda _: None, key="here")
+    qtbot.waitUntil(lambda: window.busy_bar.isVisible() and name in window.busy_label.text(), timeout=5000)
+    assert time.monotonic() - begun > after_s
+    assert window.busy_bar.maximum() == 0
+    go_on.set()
+    qtbot.waitUntil(lambda: (window.busy_bar.value(), window.busy_bar.maximum()) == (3, 8), timeout=5000)
+    end.set()
+    qtbot.waitUntil(lambda: not window.busy_bar.isVisible(), timeout=5000)
 
 
 def test_garbage_is_collected_in_the_windows_thread_only(window: MainWindow, qtbot) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,9 @@ VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView, TrackingV
 _FIRST_VIEW = {"recording": "recording", "result": "field", "scenario": "layout", "track": "tracking"}
 _FILES = "All of ours (*.h5 *.hdf5 *.toml *.sigmf-meta *.sigmf-data);;All files (*)"
 _BUSY_AFTER_MS = 250
+_OFTEN = ("Map", "Getting ready", "Live")
+"""Jobs that come with every drag or second: their progress is shown only where they last."""
+_LONG_S = 1.0
 _KEYS = (
     ("Ctrl+O, Ctrl+Shift+O", "open a file, a directory"),
     ("F5", "read the open file again"),
@@ -99,6 +103,7 @@ class MainWindow(QMainWindow):
         self._build_menu()
         self._build_pages()
         self.workers.changed.connect(self._busy_timer.start)
+        self.workers.progressed.connect(self._show_busy)
         self.workers.run("Getting ready", lambda _: prepare(), lambda _: None)
 
     # -- building ----------------------------------------------------------------------------------------
@@ -420,12 +425,17 @@ class MainWindow(QMainWindow):
         self.message_label.setText(html.escape(message.text))
 
     def _show_busy(self) -> None:
-        jobs = [job for job in self.workers.jobs if job.name not in ("Map", "Getting ready", "Live")]
+        now = time.monotonic()
+        jobs = [job for job in self.workers.jobs if job.name not in _OFTEN or now - job.begun_s >= _LONG_S]
+        if len(jobs) < len(self.workers.jobs):
+            self._busy_timer.start()  # they may turn out to be long
         for widget in (self.busy_label, self.busy_bar, self.busy_cancel):
             widget.setVisible(bool(jobs))
         if jobs:
             self.busy_label.setText(", ".join(dict.fromkeys(job.name for job in jobs)))
-            self.busy_bar.setRange(0, 0)
+            done, total = jobs[0].told
+            self.busy_bar.setRange(0, total)  # none: it only moves
+            self.busy_bar.setValue(done)
 
     def show_keys(self) -> None:
         """List the keys."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -44,6 +45,9 @@ class Job(QObject):
         super().__init__()
         self.name = name
         self._work, self._done, self._failed = work, done, failed
+        self.begun_s = time.monotonic()
+        self.told: tuple[int, int] = (0, 0)
+        """Done and in all, as it last said; nothing in all: not said."""
         self._cancelled = threading.Event()
         self._value: Any = None
         self._problem: str | None = None
@@ -96,6 +100,7 @@ class Job(QObject):
     @Slot(int, int)
     def _on_told(self, done: int, total: int) -> None:
         if not self._cancelled.is_set():
+            self.told = (done, total)
             self.progressed.emit(done, total)
 
     @Slot()
@@ -114,10 +119,11 @@ class Job(QObject):
 class Workers(QObject):
     """The jobs under way. A job with the key of an earlier one takes its place.
 
-    ``changed`` tells that the set of jobs changed.
+    ``changed`` tells that the set of jobs changed, ``progressed`` that one of them got on.
     """
 
     changed = Signal()
+    progressed = Signal()
 
     def __init__(self, failed: Callable[[str], None], parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -151,6 +157,7 @@ class Workers(QObject):
             self._by_key[key].cancel()
         job = Job(name, work, done, failed or self._failed)
         job.ended.connect(lambda: self._forget(job, key))
+        job.progressed.connect(lambda *_: self.progressed.emit())
         self._jobs.append(job)
         self._by_key[key] = job
         if self._closed:
