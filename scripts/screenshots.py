@@ -1,4 +1,4 @@
-"""Pictures of the viewer for docs/viewer.md, drawn without a screen: docs/images/viewer_*.png.
+"""Pictures of the viewer and of a report for docs/viewer.md, drawn without a screen: viewer_*.png and report.png.
 
     .venv/bin/python scripts/screenshots.py [--output DIRECTORY]
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,6 +22,7 @@ import numpy as np
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.process import process
+from rfpose.pipeline.report import report_html
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import TrackChanges, track
 from rfpose.scenario import load_scenario
@@ -130,6 +132,21 @@ def welcome(output: Path, path: Path) -> None:
     print(output)
 
 
+def report(path: Path, output: Path) -> None:
+    """Write a picture of the report as a browser without a network shows it."""
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        print(f"{output}: not drawn, since no Chromium is here")
+        return
+    page = Path("report.html").resolve()
+    page.write_text(report_html(path))
+    # a host that does not resolve: whatever the page would fetch is not there
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    command += ["--host-resolver-rules=MAP * ~NOTFOUND", "--window-size=1280,800"]
+    subprocess.run([*command, f"--screenshot={output}", page.as_uri()], check=True, capture_output=True)
+    print(output)
+
+
 def main() -> None:
     """Make files to show, then the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -156,6 +173,7 @@ def main() -> None:
         shoot(result, out / "viewer_field.png", view="field", frame=5, heliostat=4)
         shoot(large_site(folder), out / "viewer_layout.png", view="layout")
         shoot(scenario, out / "viewer_layout_dark.png", view="layout", theme="dark")
+        report(result, out / "report.png")
         tracking(day, out / "viewer_tracking.png")
         tracked = Path("tracking_100m.toml")
         tracked.write_text(shipped_scenario(tracked.name).read_text())
