@@ -73,3 +73,17 @@ def test_private_names_stay_in_their_module(path):
             for depth, part in enumerate(whole):
                 if part.startswith("_") and not (part == "_kernels" and here[-1] == "_kernels.py"):
                     assert here[:depth] == whole[:depth], f"{'.'.join(whole)} is the package's own"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT / "src")))
+def test_functions_have_few_parameters(path):
+    """What belongs together is a record; a command's options become one by `rfpose.cli._support.gathered`.
+
+    Kernels take arrays side by side, since numba knows no records of records.
+    """
+    if path.name == "_kernels.py":
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            count = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs])
+            assert count <= 12, f"line {node.lineno}: {count} parameters"

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import click
 
@@ -33,6 +34,7 @@ __all__ = [
     "examples",
     "follow_links_option",
     "force_option",
+    "gathered",
     "in_options",
     "outputs",
     "progress",
@@ -99,6 +101,24 @@ def follow_links_option(function: F) -> F:
         is_flag=True,
         help="Read what a recording names outside its own folder. [default: refuse; it may come from elsewhere]",
     )(function)
+
+
+def gathered(parameter: str, record: type) -> Callable[[F], F]:
+    """Hand a command those options that are fields of ``record`` as one, in its parameter ``parameter``.
+
+    It stands under the options, which keep their order in the help.
+    """
+    names = [each.name for each in fields(record)]
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def called(*args: Any, **options: Any) -> Any:
+            options[parameter] = record(**{name: options.pop(name) for name in names})
+            return function(*args, **options)
+
+        return cast(F, called)
+
+    return decorate
 
 
 def examples(*lines: str) -> str:

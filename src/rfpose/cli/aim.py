@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from rfpose.cli._support import (
     emit_json,
     examples,
     force_option,
+    gathered,
     outputs,
     progress,
     say,
@@ -30,6 +32,19 @@ _SHOWN = 24
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Wanted:
+    """Arguments of `rfpose.pipeline.aim.plan_commands`; the site in degrees."""
+
+    target_enu_m: tuple[float, float, float] | None
+    start: str
+    hours: float
+    step_s: float
+    heliostats: tuple[str, ...]
+    site: tuple[float, float, float] | None
+    n_next: int
+
+
 @click.command(
     name="aim",
     epilog=examples(
@@ -39,7 +54,9 @@ _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct",
     ),
 )
 @click.argument("model", type=click.Path(path_type=Path))
-@click.option("--target", nargs=3, type=float, metavar="E N U", help="Aim point in the site's frame [m].")
+@click.option(
+    "--target", "target_enu_m", nargs=3, type=float, metavar="E N U", help="Aim point in the site's frame [m]."
+)
 @click.option("--dish", is_flag=True, help="No aim point: the mirror's normal points at the sun.")
 @click.option("--start", required=True, metavar="TIME", help="First time, such as 2026-06-21T06:00Z.")
 @click.option("--hours", default=12.0, show_default=True, help="How long.")
@@ -50,29 +67,18 @@ _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct",
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="Write the commands as CSV.")
 @force_option
 @common_options
-def command(
-    model: Path,
-    target: tuple[float, float, float] | None,
-    dish: bool,
-    start: str,
-    hours: float,
-    step_s: float,
-    heliostats: tuple[str, ...],
-    site: tuple[float, float, float] | None,
-    n_next: int,
-    output: Path | None,
-    force: bool,
-) -> None:
+@gathered("wanted", _Wanted)
+def command(model: Path, dish: bool, wanted: _Wanted, output: Path | None, force: bool) -> None:
     """Turn aim points and times into motor positions, every known error of the mounts undone.
 
     MODEL is what `rfpose calibrate -o` wrote. Uncertainties are of the mirror normal: what the calibration left open,
     and with the scatter about the model that it found.
     """
-    if dish == (target is not None):
+    if dish == (wanted.target_enu_m is not None):
         raise click.UsageError("give either --target E N U, or --dish")
     with outputs(output, inputs=[model], force=force), progress("Aiming"):
         check_there(model)
-        plans = _plans(model, target, start, hours, step_s, heliostats, site, n_next)
+        plans = _plans(model, wanted)
         if output is not None:
             from rfpose.pipeline.aim import write_commands
 
@@ -86,31 +92,13 @@ def command(
         say(f"wrote {output}")
 
 
-def _plans(
-    model: Path,
-    target: tuple[float, float, float] | None,
-    start: str,
-    hours: float,
-    step_s: float,
-    heliostats: tuple[str, ...],
-    site: tuple[float, float, float] | None,
-    n_next: int,
-) -> tuple[Plan, ...]:
+def _plans(model: Path, wanted: _Wanted) -> tuple[Plan, ...]:
     """Plan what the options name."""
     from rfpose.pipeline.aim import plan_commands
     from rfpose.sun import site_from_degrees
 
-    place = None if site is None else site_from_degrees(*site)
-    return plan_commands(
-        model,
-        target_enu_m=target,
-        start=start,
-        hours=hours,
-        step_s=step_s,
-        heliostats=heliostats,
-        site=place,
-        n_next=n_next,
-    )
+    place = None if wanted.site is None else site_from_degrees(*wanted.site)
+    return plan_commands(model, **(asdict(wanted) | {"site": place}))
 
 
 def _show(plan: Plan) -> None:

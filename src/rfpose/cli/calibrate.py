@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from rfpose.cli._support import (
     emit_json,
     examples,
     force_option,
+    gathered,
     in_options,
     outputs,
     progress,
@@ -32,6 +34,30 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 _SHOWN_ALARMS = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sources:
+    """What measured the heliostats: arguments of `rfpose.calibrate`."""
+
+    directory: Path | None
+    mounts: Path | None
+    radio: tuple[Path, ...]
+    motors: Path | None
+    camera: Path | None
+    drone: Path | None
+
+    def check(self) -> None:
+        """Refuse what does not go together."""
+        directory, mounts, radio, camera, drone = self.directory, self.mounts, self.radio, self.camera, self.drone
+        if directory is None and mounts is None:
+            raise click.UsageError("give a PAINT DIRECTORY, or --mount with --radio, --camera or --drone")
+        if directory is None and not (radio or camera or drone):
+            raise click.UsageError("--mount needs measurements: a PAINT DIRECTORY, --radio, --camera or --drone")
+        if bool(radio) != (self.motors is not None):
+            raise click.UsageError(
+                "--radio and --motors belong together: a pose alone does not say what the motors did"
+            )
 
 
 @click.command(
@@ -69,13 +95,9 @@ _SHOWN_ALARMS = 12
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the errors: .png, .pdf, .svg.")
 @force_option
 @common_options
+@gathered("sources", _Sources)
 def command(
-    directory: Path | None,
-    mounts: Path | None,
-    radio: tuple[Path, ...],
-    motors: Path | None,
-    camera: Path | None,
-    drone: Path | None,
+    sources: _Sources,
     heliostats: tuple[str, ...],
     parameters: str,
     algorithm: str,
@@ -90,29 +112,20 @@ def command(
     Errors are of the mirror normal; the beam's are twice that. Held-out: ten random splits, 60 % fitted, 40 % judged.
     Radio poses need motor positions, and a second source to tell the receivers' plane from the mirror.
     """
-    if directory is None and mounts is None:
-        raise click.UsageError("give a PAINT DIRECTORY, or --mount with --radio, --camera or --drone")
-    if directory is None and not (radio or camera or drone):
-        raise click.UsageError("--mount needs measurements: a PAINT DIRECTORY, --radio, --camera or --drone")
-    if bool(radio) != (motors is not None):
-        raise click.UsageError("--radio and --motors belong together: a pose alone does not say what the motors did")
-
+    sources.check()
     check_ending(output, ".json", ".toml")
     check_ending(picture, ".png", ".pdf", ".svg")
-    inputs = [directory, mounts, *radio, motors, camera, drone]
+    inputs = [sources.directory, sources.mounts, *sources.radio, sources.motors, sources.camera, sources.drone]
     with outputs(output, picture, inputs=inputs, force=force), progress("Fitting"):
         check_there(*inputs)
-        check_directory(directory)
+        check_directory(sources.directory)
         from rfpose.drawing import save_figure
         from rfpose.feedback.mount import PARAMETERS
 
+        given = asdict(sources)
         reports = rfpose.calibrate(
-            directory,
-            mounts=mounts,
-            radio=radio,
-            motors=motors,
-            camera=camera,
-            drone=drone,
+            given.pop("directory"),
+            **given,
             heliostats=heliostats,
             parameters=tuple(parameters.split(",")) if "," in parameters or parameters in PARAMETERS else parameters,
             algorithm=algorithm,

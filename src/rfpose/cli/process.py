@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from rfpose.cli._support import (
     examples,
     follow_links_option,
     force_option,
+    gathered,
     outputs,
     progress,
     say,
@@ -29,6 +32,26 @@ __all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "REFLECTION_NAMES", "command"]
 ESTIMATOR_NAMES = ("hilbert", "correlator", "dot", "dot-compensated")
 POSE_NAMES = ("rigid", "site", "independent")
 REFLECTION_NAMES = ("estimate", "ignore")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _How:
+    """Arguments of `rfpose.process` that say how."""
+
+    estimator: str
+    pose: str
+    reflection: str | None
+    integrity: bool | None
+    filtered: bool | None
+    survey: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Tables:
+    """Tables to write besides the result."""
+
+    csv: Path | None
+    parquet: Path | None
 
 
 @click.command(
@@ -83,26 +106,22 @@ REFLECTION_NAMES = ("estimate", "ignore")
     type=click.Path(path_type=Path),
     help="Take receivers' places, pivots and transmitters from a file of `rfpose survey`.",
 )
-@click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
+@click.option("--csv", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
 @click.option("--profile", is_flag=True, help="Also tell the seconds of each stage, and what takes longest.")
 @follow_links_option
 @force_option
 @common_options
+@gathered("how", _How)
+@gathered("tables", _Tables)
 @click.pass_obj
 def command(
     session: Session,
     recording: Path,
     output: Path,
     scenario: Path | None,
-    estimator: str,
-    pose: str,
-    reflection: str | None,
-    integrity: bool | None,
-    filtered: bool | None,
-    survey: Path | None,
-    csv_path: Path | None,
-    parquet: Path | None,
+    how: _How,
+    tables: _Tables,
     profile: bool,
     follow_links: bool,
     force: bool,
@@ -114,38 +133,29 @@ def command(
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    claimed = outputs(output, csv_path, parquet, inputs=[recording, scenario, survey], force=force)
-    from rfpose.pipeline.stages import Stages
-
-    stages = Stages()
+    claimed = outputs(output, tables.csv, tables.parquet, inputs=[recording, scenario, how.survey], force=force)
     with claimed, progress("Measuring") as on_progress:
-        check_table(parquet, ".parquet")
+        check_table(tables.parquet, ".parquet")
         result = rfpose.process(
             recording,
             output,
             scenario=scenario,
-            estimator=estimator,
-            pose=pose,
-            reflection=reflection,
-            integrity=integrity,
-            filtered=filtered,
-            survey=survey,
+            **asdict(how),
             follow_links=follow_links,
             force=force,
-            stages=stages,
             on_progress=on_progress,
         )
         from rfpose.pipeline.formats.result_summary import pose_table, write_poses_csv
         from rfpose.tables import write_parquet
 
-        if csv_path is not None:
-            write_poses_csv(result, csv_path)
-        if parquet is not None:
-            write_parquet(parquet, *pose_table(result))
+        if tables.csv is not None:
+            write_poses_csv(result, tables.csv)
+        if tables.parquet is not None:
+            write_parquet(tables.parquet, *pose_table(result))
         summary = result.summary()
     if wants_json():
-        told = {"profile": stages.summary()} if profile else {}
-        emit_json({"result": output, "csv": csv_path, "parquet": parquet, **summary, **told})
+        told = {"profile": result.profile} if profile else {}
+        emit_json({"result": output, **asdict(tables), **summary, **told})
         return
     table(
         str(output),
@@ -160,11 +170,11 @@ def command(
             say(f"  {count} {what}: {reason}")
     for line in _findings(summary):
         say(f"  {line}")
-    if profile:
-        _say_stages(stages.summary())
+    if profile and result.profile is not None:
+        _say_profile(result.profile)
 
 
-def _say_stages(profile: dict[str, Any]) -> None:
+def _say_profile(profile: Mapping[str, Any]) -> None:
     """Tell where the time went."""
     table("Seconds by stage", ["", "s"], [[name, f"{value:.2f}"] for name, value in profile["seconds"].items()])
     if profile["samples_per_s"] is not None:

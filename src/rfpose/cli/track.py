@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from rfpose.cli._support import (
     emit_json,
     examples,
     force_option,
+    gathered,
     outputs,
     progress,
     say,
@@ -30,6 +32,55 @@ _METHODS = (
     "open-loop", "encoder", "bias", "berenguel", "camera-model", "drone-model", "sun-sensor", "radio", "radio-model",
     "radio-both",
 )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Changes:
+    """What the run takes instead of what the scenario says: `rfpose.pipeline.track.TrackChanges`."""
+
+    days: int | None
+    day_interval: int | None
+    sky: str | None
+    events: tuple[dict[str, Any], ...]
+    without_field_control: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Files:
+    """What is written besides the result."""
+
+    csv: Path | None
+    parquet: Path | None
+    series: Path | None
+    picture: Path | None
+
+
+def _event(text: str) -> dict[str, Any]:
+    """Read an event of the command line into the keys of ``[[tracking.event]]``."""
+    words = text.split()
+    day, _, hour = words[0].rpartition(":") if words else ("", "", "")
+    try:
+        if not 2 <= len(words) <= 3:
+            raise ValueError
+        event: dict[str, Any] = {"hour": float(hour), "what": words[1]} | ({"day": int(day)} if day else {})
+        if len(words) == 3:
+            who = words[2]
+            event |= {"cluster": int(who[1:])} if who.startswith("#") else {"heliostats": tuple(who.split(","))}
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r} must be '[DAY:]HOUR WHAT [WHO]', such as '11.5 emergency', '9 calibrate H01,H02' or "
+            "'2:12 cluster-fails #0'",
+            param_hint="'--event'",
+        ) from None
+    return event
+
+
+def _events(_ctx: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
+    return tuple(_event(text) for text in texts)
+
+
+def _names(_ctx: click.Context, _option: click.Parameter, text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",")) if text else ()
 
 
 @click.command(
@@ -47,7 +98,10 @@ _METHODS = (
 @click.argument("scenario", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Result to write (HDF5).")
 @click.option(
-    "--methods", metavar="NAMES", help=f"Comma-separated; default: all that fit. Known: {', '.join(_METHODS)}."
+    "--methods",
+    metavar="NAMES",
+    callback=_names,
+    help=f"Comma-separated; default: all that fit. Known: {', '.join(_METHODS)}.",
 )
 @click.option("--days", type=click.IntRange(min=1), help="How many days; default: the scenario's.")
 @click.option("--day-interval", type=click.IntRange(min=1), help="Days from one simulated day to the next.")
@@ -60,6 +114,7 @@ _METHODS = (
     "events",
     multiple=True,
     metavar="'[DAY:]HOUR WHAT [WHO]'",
+    callback=_events,
     help="Something that happens, as in [[tracking.event]]: '11.5 emergency', '9 calibrate H01,H02', "
     "'2:12 cluster-fails #0'. WHO: names, or # and the number of a cluster. May be repeated.",
 )
@@ -69,10 +124,11 @@ _METHODS = (
 @click.option(
     "--check-iq",
     metavar="NAMES",
+    callback=_names,
     help="Also take these mirrors through samples and the whole chain in 16 postures: does the radio model hold?",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Same seed, same result.")
-@click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
+@click.option("--csv", type=click.Path(path_type=Path), help="Also write one row a method and mirror.")
 @click.option("--parquet", type=click.Path(path_type=Path), help="The same as Parquet; needs pyarrow.")
 @click.option(
     "--series",
@@ -82,24 +138,19 @@ _METHODS = (
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
 @force_option
 @common_options
+@gathered("changes", _Changes)
+@gathered("files", _Files)
 @click.pass_obj
 def command(
     session: Session,
     scenario: Path,
     output: Path,
-    methods: str | None,
-    days: int | None,
-    day_interval: int | None,
+    methods: tuple[str, ...],
     heliostats: int | None,
-    sky: str | None,
-    events: tuple[str, ...],
-    without_field_control: bool,
-    check_iq: str | None,
+    check_iq: tuple[str, ...],
     seed: int,
-    csv_path: Path | None,
-    parquet: Path | None,
-    series: Path | None,
-    picture: Path | None,
+    changes: _Changes,
+    files: _Files,
     force: bool,
 ) -> None:
     """Track a field in simulation, by each method on the same sun, wind and hidden errors; rank the methods.
@@ -110,11 +161,11 @@ def command(
     mirror normal; the beam turns by twice as much.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    check_ending(picture, ".png", ".svg", ".pdf")
-    check_table(parquet, ".parquet")
-    check_table(series, ".csv", ".parquet")
-    happenings = [_event(text) for text in events]
-    claimed = outputs(output, csv_path, parquet, series, picture, inputs=[scenario], force=force)
+    check_ending(files.picture, ".png", ".svg", ".pdf")
+    check_table(files.parquet, ".parquet")
+    check_table(files.series, ".csv", ".parquet")
+    written = asdict(files)
+    claimed = outputs(output, *written.values(), inputs=[scenario], force=force)
     with claimed, progress("Tracking") as on_progress:
         from rfpose.drawing import save_figure
         from rfpose.pipeline.track import TrackChanges
@@ -123,33 +174,25 @@ def command(
         found = rfpose.track(
             scenario,
             output,
-            methods=tuple(name.strip() for name in methods.split(",")) if methods else (),
-            changes=TrackChanges(
-                days=days,
-                day_interval=day_interval,
-                sky=sky,
-                events=happenings,
-                without_field_control=without_field_control,
-            ),
+            methods=methods,
+            changes=TrackChanges(**asdict(changes)),
             heliostats=heliostats,
-            check_iq=tuple(name.strip() for name in check_iq.split(",")) if check_iq else (),
+            check_iq=check_iq,
             seed=seed,
             force=force,
             on_progress=on_progress,
         )
-        if csv_path is not None:
-            write_csv(csv_path, *found.table())
-        if parquet is not None:
-            write_parquet(parquet, *found.table())
-        if series is not None:
-            write_table(series, *found.series_table())
-        if picture is not None:
-            save_figure(found.plot(), picture)
+        if files.csv is not None:
+            write_csv(files.csv, *found.table())
+        if files.parquet is not None:
+            write_parquet(files.parquet, *found.table())
+        if files.series is not None:
+            write_table(files.series, *found.series_table())
+        if files.picture is not None:
+            save_figure(found.plot(), files.picture)
         summary = found.as_dict()
     if wants_json():
-        emit_json(
-            {"result": output, "csv": csv_path, "parquet": parquet, "series": series, "picture": picture, **summary}
-        )
+        emit_json({"result": output, **written, **summary})
         return
     n_day = len(summary["days"])
     table(
@@ -189,26 +232,6 @@ def command(
         if summary["methods"][name]["out_of_reach"]:
             share = 100.0 * summary["methods"][name]["out_of_reach"]
             say(f"  {name}: {share:.2g} % of the time mirrors could not face their aim point")
-
-
-def _event(text: str) -> dict[str, Any]:
-    """Read an event of the command line into the keys of ``[[tracking.event]]``."""
-    words = text.split()
-    day, _, hour = words[0].rpartition(":") if words else ("", "", "")
-    try:
-        if not 2 <= len(words) <= 3:
-            raise ValueError
-        event: dict[str, Any] = {"hour": float(hour), "what": words[1]} | ({"day": int(day)} if day else {})
-        if len(words) == 3:
-            who = words[2]
-            event |= {"cluster": int(who[1:])} if who.startswith("#") else {"heliostats": tuple(who.split(","))}
-    except ValueError:
-        raise click.BadParameter(
-            f"{text!r} must be '[DAY:]HOUR WHAT [WHO]', such as '11.5 emergency', '9 calibrate H01,H02' or "
-            "'2:12 cluster-fails #0'",
-            param_hint="'--event'",
-        ) from None
-    return event
 
 
 def _say_field_control(name: str, found: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,8 +44,6 @@ def process(
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
-    resume: bool = True,
-    stages: Stages | None = None,
 ) -> Result:
     """Find receiver positions and mirror normals in a recording.
 
@@ -77,10 +76,6 @@ def process(
         Overwrite an existing result, and discard unfinished work of another job on the same result.
     on_progress
         Called with (rows done, rows in all); a row is one receiver in one frame.
-    resume
-        False: measure everything again even if unfinished work of the same job is there.
-    stages
-        Takes the time of each stage.
 
     Raises
     ------
@@ -106,7 +101,7 @@ def process(
     >>> result.poses.normal_enu.shape
     (2, 2, 3)
     """
-    stages = Stages() if stages is None else stages
+    stages = Stages()
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
     scenario_file = None if isinstance(scenario, Scenario) else scenario
@@ -139,7 +134,7 @@ def process(
                 note_doubts(opened)
                 journal = None
                 if kept is not None:
-                    journal = Journal(kept, journal_key(opened, site, estimator), restart=force, resume=resume)
+                    journal = Journal(kept, journal_key(opened, site, estimator), restart=force)
             tones = measure_tones(
                 opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress, stages=stages
             )
@@ -158,7 +153,7 @@ def process(
                 write_result(result, output)
         if journal is not None:
             job.afterwards(journal.remove)
-        return result
+        return replace(result, profile=stages.summary())
 
 
 def _opened(recording: Recording | str | Path, *, follow_links: bool) -> contextlib.AbstractContextManager[Recording]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import field_options, postures
+from rfpose.cli.layout._options import Studied, field_options
 
 __all__ = ["command"]
 
@@ -67,11 +66,7 @@ def command(
     seed: int,
     output: Path | None,
     picture: Path | None,
-    field: Path | None,
-    suns_deg: tuple[tuple[float, float], ...],
-    day: datetime | None,
-    year: int | None,
-    stow: bool,
+    studied: Studied,
     force: bool,
 ) -> None:
     """Say where the error of the normals comes from, worst first, and what would reduce it.
@@ -81,15 +76,15 @@ def command(
     `site` also [multipath], [antenna] and [site.structures].
     """
     check_ending(picture, ".png", ".svg")
-    claimed = outputs(output, picture, inputs=[scenario, field], force=force)
+    claimed = outputs(output, picture, inputs=[scenario, studied.field], force=force)
     with claimed, progress("Drawing") as on_progress:
         check_scenario(scenario)
         from rfpose.drawing import save_figure
 
         found = rfpose.budget(
             scenario,
-            postures=postures(suns_deg, day, year, stow),
-            field=field,
+            postures=studied.postures(),
+            field=studied.field,
             pose=pose,
             ground=ground,
             n_draw=draws,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 
 import click
@@ -20,7 +19,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import ESTIMATORS, field_options, postures
+from rfpose.cli.layout._options import ESTIMATORS, Studied, field_options
 
 __all__ = ["command"]
 
@@ -48,11 +47,7 @@ def command(
     cost: tuple[float, float, float],
     picture: Path | None,
     csv_path: Path | None,
-    field: Path | None,
-    suns_deg: tuple[tuple[float, float], ...],
-    day: datetime | None,
-    year: int | None,
-    stow: bool,
+    studied: Studied,
     force: bool,
 ) -> None:
     """Compare layouts: what their normals can be known to, in the same postures, and what they cost."""
@@ -60,7 +55,7 @@ def command(
         raise click.UsageError("give two scenarios or more to compare")
     check_ending(picture, ".png", ".svg", ".pdf")
     check_table(csv_path, ".csv", ".parquet")
-    claimed = outputs(picture, csv_path, inputs=[*scenarios, field], force=force)
+    claimed = outputs(picture, csv_path, inputs=[*scenarios, studied.field], force=force)
     with claimed, progress("Mapping") as on_progress:
         for scenario in scenarios:
             check_scenario(scenario)
@@ -71,8 +66,8 @@ def command(
         found = compare(
             scenarios,
             estimators=estimators or None,
-            postures=postures(suns_deg, day, year, stow),
-            field=field,
+            postures=studied.postures(),
+            field=studied.field,
             costs=Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
             on_progress=on_progress,
         )

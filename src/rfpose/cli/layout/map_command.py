@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import ESTIMATORS, field_options, postures
+from rfpose.cli.layout._options import ESTIMATORS, Studied, field_options
 from rfpose.shown import counted
 
 __all__ = ["command"]
@@ -64,18 +63,14 @@ def command(
     sensitivity: bool,
     picture: Path | None,
     csv_path: Path | None,
-    field: Path | None,
-    suns_deg: tuple[tuple[float, float], ...],
-    day: datetime | None,
-    year: int | None,
-    stow: bool,
+    studied: Studied,
     force: bool,
 ) -> None:
     """Say what each mirror's normal can be known to, and what the loss of each transmitter costs."""
     if (tower is not None or behind) and sight is None:
         raise click.UsageError("--tower and --behind need --line-of-sight WIDTH HEIGHT, the size of the plates")
     check_ending(picture, ".png", ".svg")
-    with outputs(picture, csv_path, inputs=[scenario, field], force=force), progress("Mapping"):
+    with outputs(picture, csv_path, inputs=[scenario, studied.field], force=force), progress("Mapping"):
         check_scenario(scenario)
         from rfpose.drawing import save_figure
         from rfpose.layout.sight import Plates, Tower
@@ -90,8 +85,8 @@ def command(
         found = rfpose.layout_map(
             scenario,
             estimators=estimators or None,
-            postures=postures(suns_deg, day, year, stow),
-            field=field,
+            postures=studied.postures(),
+            field=studied.field,
             tone_snr_db=tone_snr_db,
             sight=seen,
             sensitivity=sensitivity,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,16 +16,17 @@ from rfpose.cli._support import (
     emit_json,
     examples,
     force_option,
+    gathered,
     outputs,
     progress,
     say,
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import CRITERIA, field_options, postures
+from rfpose.cli.layout._options import CRITERIA, Studied, field_options
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.layout import Rules, SitePlacement, SitePlacements
+    from rfpose.pipeline.layout import SitePlacement, SitePlacements
 
 __all__ = ["command"]
 
@@ -49,6 +50,41 @@ class _Counts(click.ParamType[range]):
         return counts
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Files:
+    """What is written."""
+
+    output: Path | None
+    csv: Path | None
+    picture: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Search:
+    """What is searched for, and how long."""
+
+    minimise: str
+    statistic: str
+    cost: tuple[float, float, float]
+    starts: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Where:
+    """Where towers may stand: `rfpose.pipeline.layout.Rules`, named before they are loaded."""
+
+    radius_m: float | None
+    outline_csv: Path | None
+    allowed_m: tuple[tuple[float, float, float], ...]
+    excluded_m: tuple[tuple[float, float, float], ...]
+    height_m: tuple[float, float] | None
+    separation_m: float | None
+    clearance_m: float
+    sight_m: float | None
+    keep: int
+
+
 _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "metavar": "X Y R"}
 
 
@@ -65,7 +101,7 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the scenario with the new places.")
 @click.option("-n", "--transmitters", type=click.IntRange(min=1), help="How many; default: as many as there are.")
 @click.option("--pareto", type=_Counts(), metavar="N1..N2", help="Instead, the best of each number: cost and accuracy.")
-@click.option("--csv", "csv_path", type=click.Path(path_type=Path), help="With --pareto: one row a number.")
+@click.option("--csv", type=click.Path(path_type=Path), help="With --pareto: one row a number.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Before and after, or the curve: PNG, SVG or PDF.")
 @click.option("--minimise", type=click.Choice(CRITERIA), default="pdop", show_default=True,
               help="PDOP, or the normal's bound; `site`: what pose `site` states among reflections.")  # fmt: skip
@@ -77,8 +113,8 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
     type=click.Path(path_type=Path),
     help="CSV of corners of the allowed ground.",
 )
-@click.option("--allow", **_CIRCLE, help="Further ground that may be used: a circle [m].")
-@click.option("--exclude", **_CIRCLE, help="Circle kept free [m].")
+@click.option("--allow", "allowed_m", **_CIRCLE, help="Further ground that may be used: a circle [m].")
+@click.option("--exclude", "excluded_m", **_CIRCLE, help="Circle kept free [m].")
 @click.option("--height", "height_m", type=(float, float), metavar="LOW HIGH", help="Antennas [m]; default: as now.")
 @click.option(
     "--separation",
@@ -99,105 +135,71 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @click.option("--starts", type=click.IntRange(min=1), default=30, show_default=True,
               help="Random starts; with `--minimise site`, places tried for each tower in each round.")  # fmt: skip
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@gathered("files", _Files)
+@gathered("search", _Search)
+@gathered("where", _Where)
 @field_options
 @force_option
 @common_options
 def command(
     scenario: Path,
-    output: Path | None,
     transmitters: int | None,
     pareto: range | None,
-    csv_path: Path | None,
-    picture: Path | None,
-    minimise: str,
-    statistic: str,
-    cost: tuple[float, float, float],
-    starts: int,
-    seed: int,
-    field: Path | None,
-    suns_deg: tuple[tuple[float, float], ...],
-    day: datetime | None,
-    year: int | None,
-    stow: bool,
+    files: _Files,
+    search: _Search,
+    where: _Where,
+    studied: Studied,
     force: bool,
-    **where: Any,
 ) -> None:
     """Place the transmitters anew, for the best accuracy that the limits allow."""
-    if pareto is not None and (output is not None or transmitters is not None):
+    if pareto is not None and (files.output is not None or transmitters is not None):
         raise click.UsageError("--pareto compares numbers of transmitters; give -o and -n without it")
-    if pareto is None and csv_path is not None:
+    if pareto is None and files.csv is not None:
         raise click.UsageError("--csv goes with --pareto")
-    check_ending(picture, ".png", ".svg", ".pdf")
-    claimed = outputs(output, csv_path, picture, inputs=[scenario, field, where["outline_csv"]], force=force)
-    with claimed:
+    check_ending(files.picture, ".png", ".svg", ".pdf")
+    inputs = [scenario, studied.field, where.outline_csv]
+    with outputs(files.output, files.csv, files.picture, inputs=inputs, force=force):
         check_scenario(scenario)
         from rfpose.layout.optimise import Costs
+        from rfpose.pipeline.layout import Rules
 
         settings: dict[str, Any] = {
-            "criterion": minimise,
-            "statistic": statistic,
-            "rules": _rules(**where),
-            "costs": Costs(per_tower=cost[0], per_height_m=cost[1], per_cable_m=cost[2]),
-            "postures": postures(suns_deg, day, year, stow),
-            "field": field,
-            "starts": starts,
-            "seed": seed,
+            "criterion": search.minimise,
+            "statistic": search.statistic,
+            "rules": Rules(**asdict(where)),
+            "costs": Costs(per_tower=search.cost[0], per_height_m=search.cost[1], per_cable_m=search.cost[2]),
+            "postures": studied.postures(),
+            "field": studied.field,
+            "starts": search.starts,
+            "seed": search.seed,
         }
         if pareto is not None:
-            curve = _compare(scenario, pareto, settings, csv_path, picture)
+            curve = _compare(scenario, pareto, settings, files)
         else:
-            found = _place(scenario, transmitters, settings, output, picture)
+            found = _place(scenario, transmitters, settings, files)
     if pareto is not None:
-        _show_curve(curve.as_dict(), csv_path, picture)
+        _show_curve(curve.as_dict(), files)
     else:
-        _show_places(found.as_dict(), output, picture)
+        _show_places(found.as_dict(), files)
 
 
-def _rules(
-    radius_m: float | None,
-    outline_csv: Path | None,
-    allow: tuple[tuple[float, float, float], ...],
-    exclude: tuple[tuple[float, float, float], ...],
-    height_m: tuple[float, float] | None,
-    separation_m: float | None,
-    clearance_m: float,
-    sight_m: float | None,
-    keep: int,
-) -> Rules:
-    from rfpose.pipeline.layout import Rules
-
-    return Rules(
-        radius_m=radius_m,
-        outline_csv=outline_csv,
-        allowed_m=allow,
-        excluded_m=exclude,
-        height_m=height_m,
-        separation_m=separation_m,
-        clearance_m=clearance_m,
-        sight_m=sight_m,
-        keep=keep,
-    )
-
-
-def _place(
-    scenario: Path, transmitters: int | None, settings: dict[str, Any], output: Path | None, picture: Path | None
-) -> SitePlacement:
+def _place(scenario: Path, transmitters: int | None, settings: dict[str, Any], files: _Files) -> SitePlacement:
     from rfpose.drawing import look, save_figure
 
     with progress("Searching") as on_progress:
         found = rfpose.optimise(scenario, n_transmitter=transmitters, on_progress=on_progress, **settings)
-    if output is not None:
-        found.save(output)
-    if picture is not None:
+    if files.output is not None:
+        found.save(files.output)
+    if files.picture is not None:
         with look():
-            save_figure(found.plot(), picture)
+            save_figure(found.plot(), files.picture)
     return found
 
 
-def _show_places(summary: dict[str, Any], output: Path | None, picture: Path | None) -> None:
+def _show_places(summary: dict[str, Any], files: _Files) -> None:
     """Print where the transmitters should stand."""
     if wants_json():
-        emit_json({**summary, "output": output, "picture": picture})
+        emit_json({**summary, "output": files.output, "picture": files.picture})
         return
     unit = f" {summary['unit']}".rstrip()
     name = f"{summary['criterion']} {summary['statistic']}"
@@ -225,25 +227,23 @@ def _say_light(summary: dict[str, Any], unit: str) -> None:
         )
 
 
-def _compare(
-    scenario: Path, counts: range, settings: dict[str, Any], csv_path: Path | None, picture: Path | None
-) -> SitePlacements:
+def _compare(scenario: Path, counts: range, settings: dict[str, Any], files: _Files) -> SitePlacements:
     from rfpose.drawing import save_figure
     from rfpose.pipeline.layout import pareto
 
     with progress("Searching, number by number") as on_progress:
         curve = pareto(scenario, counts, on_progress=on_progress, **settings)
-    if csv_path is not None:
-        curve.save(csv_path)
-    if picture is not None:
-        save_figure(curve.plot(), picture)
+    if files.csv is not None:
+        curve.save(files.csv)
+    if files.picture is not None:
+        save_figure(curve.plot(), files.picture)
     return curve
 
 
-def _show_curve(summary: dict[str, Any], csv_path: Path | None, picture: Path | None) -> None:
+def _show_curve(summary: dict[str, Any], files: _Files) -> None:
     """Print what each number of transmitters would buy."""
     if wants_json():
-        emit_json({**summary, "csv": csv_path, "picture": picture})
+        emit_json({**summary, "csv": files.csv, "picture": files.picture})
         return
     unit = f" [{summary['unit']}]" if summary["unit"] else ""
     table(

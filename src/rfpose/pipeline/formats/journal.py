@@ -38,8 +38,6 @@ class Journal:
         What the entries depend on, as text. Entries written under another key are never mixed in.
     restart
         Discard entries of another key instead of refusing.
-    resume
-        False: discard entries of the same key too.
 
     Raises
     ------
@@ -47,7 +45,7 @@ class Journal:
         The directory holds the work of another key, holds something else, or cannot be read or written.
     """
 
-    def __init__(self, directory: Path, key: Mapping[str, str], *, restart: bool, resume: bool = True) -> None:
+    def __init__(self, directory: Path, key: Mapping[str, str], *, restart: bool) -> None:
         self._directory = directory
         found = self._read_key()
         if found is None:
@@ -59,8 +57,6 @@ class Journal:
                     f"{directory}: holds the unfinished work of another job (different: {differing}); repeat that "
                     "job's command to finish it, or start over with `force=True`"
                 )
-            self.remove()
-        elif not resume:
             self.remove()
         make_directory(directory)
         replace_content(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())

@@ -290,6 +290,9 @@ class Result(Shown):
         What else the chosen estimator of poses found; None where it does not look for it.
     truth
         What was really there, copied from a simulated recording; else None.
+    profile
+        Seconds by stage and what takes longest, as `rfpose process --profile` tells them; None for a result that was
+        read from a file.
     """
 
     scenario: Scenario
@@ -306,6 +309,7 @@ class Result(Shown):
     delays: DelayTable | None = None
     filtered: FilteredTable | None = None
     truth: Truth | None = None
+    profile: Mapping[str, Any] | None = None
 
     @property
     def sample_rate(self) -> Fraction:
