@@ -17,9 +17,7 @@ from rfpose.files import write_atomically
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["TABLE_ENDINGS", "Tabled", "data_frame", "labelled_library", "write_csv", "write_parquet", "write_table"]
-
-TABLE_ENDINGS = (".csv", ".parquet")
+__all__ = ["Tabled", "data_frame", "labelled_library", "write_csv", "write_parquet", "write_table"]
 
 
 class Tabled(ABC):

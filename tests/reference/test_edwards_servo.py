@@ -13,25 +13,20 @@ from rfpose.feedback.energy import (
     dish_capture,
     dish_efficiency,
     following_h_per_deg,
-    pointing_response_s,
     response_loss,
 )
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.feedback.servo import PiLaw, Stepper, limit_cycle_rad, margins, run_loop, velocity_error_rad
+from rfpose.feedback.servo import PiLaw, Stepper, limit_cycle_rad, margins, run_loop
 from rfpose.feedback.servo.margins import continuous_response
 from rfpose.feedback.servo.rules import (
     EARTH_RADPS,
     SLEW_RADPS,
     azimuth_speed_radps,
-    command_interval_s,
-    encoder_step_rad,
-    quantisation_rms_rad,
-    sampling_lag_rad,
     sensor_null_shift_rad,
     speed_command_rms_rad,
 )
 from rfpose.feedback.structure import EDWARDS_MODE, Structure, aerodynamic_damping, mass_ratio
-from rfpose.feedback.wind import perfect_servo, rigidity_gain, stowed_share, sunshine_deflection
+from rfpose.feedback.wind import perfect_servo, rigidity_gain, sunshine_deflection
 
 SOLSTICE = np.deg2rad(23.45)
 K = 7.3e-5
@@ -48,7 +43,7 @@ def test_v21_v22_v23_speed_of_the_fixed_axis():
 
 
 def test_v24_search_for_the_sun_costs_three_percent():
-    time = pointing_response_s(np.pi / 3.0, speed_radps=1e-3)
+    time = np.pi / 3.0 / 1e-3
     assert time == pytest.approx(1047.0, abs=1.0)
     # printed 3 %, a count from records; one long darkness each night is 3.8 %, and some days have no sun
     nightly = response_loss(time, bursts=Bursts(per_year=364.0))
@@ -60,7 +55,7 @@ def test_v24_search_for_the_sun_costs_three_percent():
     [(0.009, 1e-3, 5e-5), (0.09, 1e-2, 5e-4), (0.045, 5e-3, 2e-4), (0.010, 1e-3, 2e-4), (0.016, 1.8e-3, 1e-4)],
 )
 def test_v25_v26_v27_response_time(error_rad, loss, tolerance):
-    assert response_loss(pointing_response_s(error_rad)) == pytest.approx(loss, abs=tolerance)
+    assert response_loss(error_rad / SLEW_RADPS) == pytest.approx(loss, abs=tolerance)
 
 
 def test_v42_aerodynamic_damping():
@@ -93,7 +88,6 @@ def test_v46_describing_function():
 
 
 def test_v47_proportional_servo():
-    assert velocity_error_rad(PiLaw(gain_per_s=0.3, integral_gain_per_s2=0.0), K) == pytest.approx(0.2e-3, rel=0.25)
     law = PiLaw(gain_per_s=0.29, integral_gain_per_s2=0.0)
     frequency = np.geomspace(1e-3, 1.0, 20_001)
     response = continuous_response(law, EDWARDS_MODE, frequency)
@@ -106,9 +100,8 @@ def test_v47_proportional_servo():
 
 
 def test_v48_lag_of_the_sampler():
-    assert np.rad2deg(sampling_lag_rad(0.1, sampling_hz=1.0)) == pytest.approx(18.0)
     both = [continuous_response(PiLaw(), None, 0.02, interval_s=interval) for interval in (0.0, 5.0)]
-    assert np.angle(both[0] / both[1]) == pytest.approx(sampling_lag_rad(0.02, sampling_hz=0.2))
+    assert np.angle(both[0] / both[1]) == pytest.approx(np.pi * 0.02 * 5.0)
 
 
 @pytest.mark.parametrize(
@@ -164,9 +157,7 @@ def test_v55_rigidity_that_a_fast_servo_saves():
     assert rigidity_gain(mode, fast, against=slow, size_m=SIZE_M) == pytest.approx(2.6, rel=0.02)
 
 
-def test_rigidity_and_stow_in_passing():
-    assert stowed_share() == pytest.approx(0.036, abs=5e-4)
-
+def test_rigidity_in_passing():
     def slope(bore_ratio, bore_fixed):
         return (mass_ratio(1.001, bore_ratio=bore_ratio, bore_fixed=bore_fixed) - 1.0) / 1e-3
 
@@ -204,13 +195,10 @@ def test_edwards_clear_sky():
     assert beam == pytest.approx([1039.1, 1019.3, 931.3, 695.9, 492.0], abs=0.1)
 
 
-def test_m1_intercept_and_m7_control_interval_and_m9_resolution():
+def test_m1_intercept_and_m7_turn_of_the_sun():
     assert intercept_ratio(0.75e-3) == pytest.approx(0.922, abs=5e-4)
     assert intercept_ratio(1e-3) == pytest.approx(0.90, abs=0.005)
-    assert command_interval_s(1e-3) == pytest.approx(13.75, abs=0.005)
     assert pytest.approx(7.272e-5, abs=1e-8) == EARTH_RADPS
-    assert encoder_step_rad(16) == pytest.approx(0.096e-3, abs=5e-7)
-    assert quantisation_rms_rad(1.0) == pytest.approx(0.29, abs=0.002)
 
 
 def test_malans_drive():

@@ -22,7 +22,6 @@ __all__ = [
     "PhaseAverage",
     "average_phases",
     "calibrate",
-    "electronic_phase",
     "frame_times",
     "phase_average",
     "wrap",
@@ -75,7 +74,7 @@ def wrap(phase_rad: FloatArray) -> FloatArray:
     return np.asarray(np.pi - np.mod(np.pi - phase_rad, 2.0 * np.pi))
 
 
-def electronic_phase(
+def average_phases(
     phase_rad: npt.ArrayLike,
     sigma_rad: npt.ArrayLike,
     *,
@@ -83,8 +82,8 @@ def electronic_phase(
     transmitter_enu_m: npt.ArrayLike,
     wavelength_m: npt.ArrayLike,
     survey_sigma_m: npt.ArrayLike = 0.0,
-) -> tuple[FloatArray, FloatArray]:
-    """Electronic phases Φ_i = φ_i + 2π d_i / λ from the tone phases of calibration receivers (§3.6).
+) -> PhaseAverage:
+    """Return electronic phases Φ_i = φ_i + 2π d_i / λ from the tone phases of calibration receivers (§3.6).
 
     Several receivers are put on one clock and averaged with their weights.
 
@@ -101,37 +100,11 @@ def electronic_phase(
     survey_sigma_m : (calibration receiver,) or scalar
         Uncertainty of each receiver's survey [m].
 
-    Returns
-    -------
-    phase_rad, sigma_rad : (frame, transmitter, tone)
-        Wrapped to (−π, π]; NaN where no receiver saw the transmitter.
-
     Raises
     ------
     InvalidInputError
         Shapes that do not fit together.
     """
-    average = average_phases(
-        phase_rad,
-        sigma_rad,
-        calibration_enu_m=calibration_enu_m,
-        transmitter_enu_m=transmitter_enu_m,
-        wavelength_m=wavelength_m,
-        survey_sigma_m=survey_sigma_m,
-    )
-    return average.phase_rad, average.sigma_rad
-
-
-def average_phases(
-    phase_rad: npt.ArrayLike,
-    sigma_rad: npt.ArrayLike,
-    *,
-    calibration_enu_m: npt.ArrayLike,
-    transmitter_enu_m: npt.ArrayLike,
-    wavelength_m: npt.ArrayLike,
-    survey_sigma_m: npt.ArrayLike = 0.0,
-) -> PhaseAverage:
-    """Return what `electronic_phase` averages, and how; arguments and errors are its own."""
     phase = as_float_array("phase_rad", phase_rad, ("frame", "calibration", "transmitter", "tone"), finite=False)
     n_cal, n_transmitter, n_tone = phase.shape[1:]
     sigma = as_float_array("sigma_rad", sigma_rad, phase.shape, finite=False, positive=False)
@@ -346,7 +319,7 @@ def interpolate_phase(
     Parameters
     ----------
     phase_rad, sigma_rad : (frame, transmitter, tone)
-        From `electronic_phase`; NaN = not measured.
+        Of `average_phases`; NaN = not measured.
     time_s : (frame,)
         Increasing [s].
 

@@ -19,7 +19,6 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.feedback.servo.rules import SLEW_RADPS
 from rfpose.sun import Site, sun_position
 
 __all__ = [
@@ -35,7 +34,6 @@ __all__ = [
     "energy",
     "following_h_per_deg",
     "heliostat_intercept",
-    "pointing_response_s",
     "representative_days",
     "response_loss",
     "spillage",
@@ -198,12 +196,6 @@ class Bursts:
 
 GRIFFITH = Bursts()
 """Griffith, New South Wales, 1975 (Edwards, App. B): 1000 bursts longer than ten minutes hold 98 % of the hours."""
-
-
-def pointing_response_s(error_rad: npt.ArrayLike, *, speed_radps: float = SLEW_RADPS) -> FloatArray:
-    """Return how long mirrors turn after the sun comes out, their greater axis error over their speed [s]."""
-    error = as_float_array("error_rad", error_rad, ("...",))
-    return np.asarray(np.abs(error) / as_positive("speed_radps", speed_radps))
 
 
 def response_loss(response_s: npt.ArrayLike, *, bursts: Bursts = GRIFFITH) -> FloatArray:

@@ -21,9 +21,7 @@ __all__ = [
     "Structure",
     "aerodynamic_damping",
     "deflect",
-    "deflection_rad",
     "mass_ratio",
-    "natural_frequency_hz",
     "plate_mode_hz",
     "swing_transition",
 ]
@@ -69,14 +67,6 @@ class Structure:
 
 EDWARDS_MODE = Structure(natural_hz=0.1, damping=0.3)
 """The mode for which Edwards designs his servo."""
-
-
-def natural_frequency_hz(stiffness_nm_per_rad: float, inertia_kgm2: float) -> float:
-    """Return √(k/J)/2π of a mirror of inertia J on a stiffness k [Hz]."""
-    return float(
-        np.sqrt(as_positive("stiffness_nm_per_rad", stiffness_nm_per_rad) / as_positive("inertia_kgm2", inertia_kgm2))
-        / (2.0 * np.pi)
-    )
 
 
 def plate_mode_hz(
@@ -127,14 +117,6 @@ def aerodynamic_damping(
     speed = as_float_array("speed_mps", speed_mps, ("...",))
     plate = air_kg_m3 * drag_coefficient * as_positive("area_m2", area_m2) / as_positive("mass_kg", mass_kg)
     return np.asarray(plate * speed / (4.0 * np.pi * frequency))
-
-
-def deflection_rad(torque_nm: npt.ArrayLike, stiffness_nm_per_rad: float) -> FloatArray:
-    """Return what a steady torque bends [rad]."""
-    return np.asarray(
-        as_float_array("torque_nm", torque_nm, ("...",), finite=False)
-        / as_positive("stiffness_nm_per_rad", stiffness_nm_per_rad)
-    )
 
 
 def deflect(static_rad: npt.ArrayLike, structure: Structure, *, interval_s: float) -> FloatArray:

@@ -1,11 +1,10 @@
 """What a radio wave does between a transmitter and a receiver on a mirror: rays foreseen from the site's geometry."""
 
 from rfpose.propagation.foresight import Foresight, foresee
-from rfpose.propagation.rays import FIELD_DECAYS_AT_M, RayKind, Rays
+from rfpose.propagation.rays import RayKind, Rays
 from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, Soil, Stand, Surroundings, bystanders
 
 __all__ = [
-    "FIELD_DECAYS_AT_M",
     "BoxesStanding",
     "Foresight",
     "PlatesStanding",

@@ -10,10 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 
-__all__ = ["FIELD_DECAYS_AT_M", "RayKind", "Rays"]
-
-FIELD_DECAYS_AT_M = 1.0
-"""Fields are relative to what the transmitter's isotropic, vertically polarised field would be at this distance [m]."""
+__all__ = ["RayKind", "Rays"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -53,7 +50,7 @@ class Rays:
         Way before the source [m].
     field_enu : (ray, xyz)
         Complex amplitude of the electric field at the receiver, the propagation phase of the path taken off, relative
-        to the transmitter's isotropic, vertically polarised field at `FIELD_DECAYS_AT_M`: a direct ray of 50 m has
+        to the transmitter's isotropic, vertically polarised field at 1 m: a direct ray of 50 m has
         length 1/50 along the direction's θ unit vector (which points downward; see docs/real-field.md).
     kind : (ray,)
         `RayKind`.

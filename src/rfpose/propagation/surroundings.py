@@ -136,11 +136,6 @@ class Surroundings:
     boxes: BoxesStanding = field(default_factory=_no_boxes)
     soil: Soil | None = None
 
-    @property
-    def ground_thing(self) -> int:
-        """Number of the ground among the things."""
-        return len(self.plates.centre_enu_m) + len(self.boxes.base_enu_m)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stand:

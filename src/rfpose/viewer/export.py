@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from rfpose.viewer.window import MainWindow
 
-__all__ = ["VIEW_NAMES", "open_window", "png_of", "refuse_errors", "save_widget", "settle"]
+__all__ = ["VIEW_NAMES", "open_window", "png_of", "save_widget", "settle"]
 
 VIEW_NAMES = ("recording", "field", "layout", "tracking", "live")
 _TIMEOUT_S = 300.0
@@ -133,10 +133,3 @@ def open_window(
     window.session.show(document)
     settle(app, window)
     return app, window
-
-
-def refuse_errors(window: MainWindow) -> None:
-    """Raise what a window would say, instead of a picture with something missing."""
-    message = window.session.message
-    if message is not None and message.is_error:
-        raise RfposeError(message.text)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rfpose.dsp.calibration import CalibrationStatus, average_phases, electronic_phase, interpolate_phase, wrap
+from rfpose.dsp.calibration import CalibrationStatus, average_phases, interpolate_phase, wrap
 from rfpose.errors import InvalidInputError
 
 TRANSMITTER = np.random.default_rng(0).uniform(-100, 100, (6, 3))
@@ -18,6 +18,11 @@ def measured(place, electronic, clock):
     """Tone phases at surveyed places: Φ − 2πd/λ + clock."""
     range_m = np.linalg.norm(place[:, None] - TRANSMITTER, axis=-1)
     return wrap(electronic[None, None] - 2 * np.pi * range_m[None, :, :, None] / WAVELENGTH + clock)
+
+
+def electronic_phase(phase, sigma, **settings):
+    average = average_phases(phase, sigma, **settings)
+    return average.phase_rad, average.sigma_rad
 
 
 def test_electronic_phase_is_recovered_up_to_the_clock():

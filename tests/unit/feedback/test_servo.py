@@ -9,7 +9,6 @@ from rfpose.feedback.servo import (
     ServoState,
     Stepper,
     check_law,
-    count_motor,
     design_law,
     is_stable,
     margins,
@@ -18,7 +17,7 @@ from rfpose.feedback.servo import (
     servo_step,
 )
 from rfpose.feedback.servo.rules import EARTH_RADPS
-from rfpose.feedback.structure import EDWARDS_MODE, Structure, deflect, natural_frequency_hz, plate_mode_hz
+from rfpose.feedback.structure import EDWARDS_MODE, Structure, deflect, plate_mode_hz
 
 LINEAR = PiLaw(levels=0, range_rad=1.0, speed_radps=10.0)
 STEP = Stepper().step_rad
@@ -172,12 +171,13 @@ def test_counts_of_the_kernel_are_those_of_the_path():
         want = 3e-3 * np.sin(0.05 * i) + 3e-4 * rng.standard_normal((1, 2))
         servo_step(want, state.axis_rad, state, law=PiLaw(), stepper=Stepper())
         path.append(state.motor_rad.copy())
-    counted = count_motor(np.stack(path, axis=-1), step_rad=STEP)
-    steps, starts, reversals, busy = np.moveaxis(state.counts, -1, 0)
-    assert np.array_equal(np.rint(steps), counted.steps)
-    assert np.array_equal(starts, counted.starts)
-    assert np.array_equal(reversals, counted.reversals)
-    assert busy / 400 == pytest.approx(counted.duty)
+    step = np.rint(np.diff(np.stack(path, axis=-1), axis=-1) / STEP)[0]
+    moves = step != 0.0
+    steps, starts, reversals, busy = np.moveaxis(state.counts[0], -1, 0)
+    assert np.array_equal(np.rint(steps), np.abs(step).sum(axis=-1))
+    assert np.array_equal(starts, moves[:, 0] + np.sum(moves[:, 1:] & ~moves[:, :-1], axis=-1))
+    assert np.array_equal(reversals, [np.sum(np.diff(np.sign(row[row != 0.0])) != 0.0) for row in step])
+    assert np.array_equal(busy, moves.sum(axis=-1))
 
 
 def test_a_field_is_its_axes_one_by_one():
@@ -220,7 +220,6 @@ def test_structure_answers_as_its_frequency_response():
     assert deflect(np.full(50, 2e-3), mode, interval_s=1.0) == pytest.approx(2e-3)
 
 
-def test_natural_frequencies():
-    assert natural_frequency_hz((2.0 * np.pi) ** 2 * 5.0, 5.0) == pytest.approx(1.0)
+def test_frequency_of_a_flapping_dish():
     found = plate_mode_hz(0.6, density_kg_m3=7800.0, thickness_m=5e-3, deflection_1mps_rad=1e-4, diameter_m=5.0)
     assert (2.0 * np.pi * found) ** 2 == pytest.approx(0.6 / (7800.0 * 5e-3 * 1e-4 * 2.5))

@@ -101,7 +101,7 @@ def test_a_servo_takes_what_is_below_its_bandwidth():
 
 def test_load_and_deflection():
     load = WindLoad(area_m2=10.0, lever_m=0.5, stiffness_nm_per_rad=3e4)
-    assert load.torque_nm([10.0, -10.0]) == pytest.approx([300.0, -300.0])
+    assert load.torque_1mps_nm == pytest.approx(3.0)
     assert load.deflection_1mps_rad == pytest.approx(1e-4)
     assert wind_bend(load.deflection_1mps_rad, np.full(4, 5.0)) == pytest.approx(2.5e-3)
     with pytest.raises(InvalidInputError, match="lever_m"):

@@ -31,7 +31,6 @@ def test_things_without_posture_or_outline_are_left_out(scenario):
     outlined = place_things(scenario.changed(heliostat={"width_m": 2.0, "height_m": 1.0}), rot)
     assert outlined.names == ("H01", "H02", "N0", "N2", "tower", "ground")
     np.testing.assert_array_equal(outlined.own_plate, [0, 1])
-    assert outlined.surroundings.ground_thing == outlined.names.index("ground")
     plates = outlined.surroundings.plates
     np.testing.assert_allclose(plates.centre_enu_m[2], np.array([24.0, 3.0, 2.0]) + 0.5 * np.array([1, 0, 1]) / 2**0.5)
     np.testing.assert_allclose(plates.size_m, [[2, 1], [2, 1], [2, 3], [2, 3]])

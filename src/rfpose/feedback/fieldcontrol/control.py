@@ -229,11 +229,6 @@ class FieldControl:
         return np.asarray(self._time_s - self._wire.reported_s)
 
     @property
-    def stored_axis_rad(self) -> FloatArray:
-        """Axis angles by the step counts stored at the last loss of power (heliostat, axis) [rad]; NaN: none."""
-        return self._heliostats.stored_rad.copy()
-
-    @property
     def waiting(self) -> BoolArray:
         """Whether an order is on its way that is not acknowledged (heliostat,)."""
         return np.asarray(self._wire.pending != NOTHING)

@@ -10,9 +10,8 @@ from rfpose.feedback.servo.margins import (
     limit_cycle_rad,
     margins,
     sensitivity,
-    velocity_error_rad,
 )
-from rfpose.feedback.servo.response import MotorCounts, Response, count_motor, run_loop
+from rfpose.feedback.servo.response import MotorCounts, Response, run_loop
 
 __all__ = [
     "DriveNumbers",
@@ -23,7 +22,6 @@ __all__ = [
     "ServoState",
     "Stepper",
     "check_law",
-    "count_motor",
     "design_law",
     "is_stable",
     "limit_cycle_rad",
@@ -31,5 +29,4 @@ __all__ = [
     "run_loop",
     "sensitivity",
     "servo_step",
-    "velocity_error_rad",
 ]

@@ -32,13 +32,11 @@ __all__ = [
     "continuous_response",
     "design_law",
     "is_stable",
-    "level_for_limit_cycle_rad",
     "limit_cycle_rad",
     "margins",
     "sampled_plant",
     "sampled_response",
     "sensitivity",
-    "velocity_error_rad",
 ]
 
 LEAST_GAIN_MARGIN = 1.5
@@ -417,11 +415,6 @@ def limit_cycle_rad(
     return float(2.0 * law.level_rad / np.pi * gain)
 
 
-def level_for_limit_cycle_rad(amplitude_rad: float, law: PiLaw, structure: Structure | None) -> float:
-    """Return the width of level that lets these gains oscillate by an amplitude [rad]; strictly proportional."""
-    return float(as_positive("amplitude_rad", amplitude_rad) * law.level_rad / limit_cycle_rad(law, structure))
-
-
 def sensitivity(
     law: PiLaw,
     structure: Structure | None,
@@ -433,8 +426,3 @@ def sensitivity(
     """Return what part of a disturbance of the mirror is left with the loop closed, |1/(1+L)|."""
     plant = sampled_plant(structure, interval_s=interval_s, latency_s=latency_s)
     return np.asarray(1.0 / np.abs(1.0 + sampled_response(law, plant, frequency_hz)))
-
-
-def velocity_error_rad(law: PiLaw, speed_radps: float) -> float:
-    """Return how far the mirror trails behind a steady motion [rad]; the integral removes it."""
-    return 0.0 if law.integral_gain_per_s2 > 0.0 else float(speed_radps) / law.gain_per_s

@@ -14,7 +14,7 @@ from rfpose.feedback.servo.law import PiLaw, Stepper
 from rfpose.feedback.servo.margins import check_law, sampled_plant
 from rfpose.feedback.structure import Structure
 
-__all__ = ["MotorCounts", "Response", "count_motor", "run_loop"]
+__all__ = ["MotorCounts", "Response", "run_loop"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,28 +140,4 @@ def _counts(count: FloatArray, n_interval: int) -> MotorCounts:
         starts=read_only(count[..., _kernels.STARTS]),
         reversals=read_only(count[..., _kernels.REVERSALS]),
         duty=read_only(count[..., _kernels.BUSY] / max(n_interval, 1)),
-    )
-
-
-def count_motor(motor_rad: npt.ArrayLike, *, step_rad: float) -> MotorCounts:
-    """Count what motors did from where they were.
-
-    Parameters
-    ----------
-    motor_rad : (..., time)
-        Motor angles as turns of the axis [rad].
-    step_rad
-        Of one step [rad].
-    """
-    angle = as_float_array("motor_rad", motor_rad, ("...", "time"))
-    step = np.rint(np.diff(angle, axis=-1) / step_rad)
-    moves = step != 0.0
-    before = np.concatenate([np.zeros_like(moves[..., :1]), moves[..., :-1]], axis=-1)
-    flat = step.reshape(-1, step.shape[-1]) if step.size else step.reshape(-1, 0)
-    reversals = np.array([np.sum(np.diff(np.sign(row[row != 0.0])) != 0.0) for row in flat], np.float64)
-    return MotorCounts(
-        steps=np.abs(step).sum(axis=-1),
-        starts=np.sum(moves & ~before, axis=-1).astype(np.float64),
-        reversals=reversals.reshape(step.shape[:-1]),
-        duty=moves.mean(axis=-1) if step.shape[-1] else np.zeros(step.shape[:-1]),
     )

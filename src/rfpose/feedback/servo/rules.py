@@ -12,11 +12,6 @@ __all__ = [
     "EARTH_RADPS",
     "SLEW_RADPS",
     "azimuth_speed_radps",
-    "command_interval_s",
-    "cross_axis_error_rad",
-    "encoder_step_rad",
-    "quantisation_rms_rad",
-    "sampling_lag_rad",
     "sensor_null_shift_rad",
     "speed_command_rms_rad",
 ]
@@ -60,31 +55,6 @@ def speed_command_rms_rad(interval_s: float, bits: int, *, speed_radps: float = 
     return float(np.sqrt(2.0 / 3.0) / np.sqrt(3.0) * end)
 
 
-def quantisation_rms_rad(step_rad: float) -> float:
-    """Return the rms error of a value rounded to steps, 0.29 of a step [rad]."""
-    return float(as_positive("step_rad", step_rad) / np.sqrt(12.0))
-
-
-def encoder_step_rad(bits: int) -> float:
-    """Return the resolution of a turn told in so many bits [rad] (Malan: 16 bits are 0.096 mrad)."""
-    if bits < 1:
-        raise InvalidInputError(f"`bits` must be one or more, got {bits}")
-    return float(2.0 * np.pi / 2**bits)
-
-
-def command_interval_s(drift_rad: float, *, rate_radps: float = EARTH_RADPS) -> float:
-    """Return how long a mirror may rest until the sun has gone on by an angle [s] (Malan §3.3).
-
-    For 1 mrad of the sun itself 13.75 s; a heliostat's normal goes on by no more than half of that.
-    """
-    return float(as_positive("drift_rad", drift_rad) / as_positive("rate_radps", rate_radps))
-
-
-def sampling_lag_rad(frequency_hz: float, *, sampling_hz: float) -> float:
-    """Return the lag of a sampler that holds its value, π f/f_s [rad]."""
-    return float(np.pi * frequency_hz / as_positive("sampling_hz", sampling_hz))
-
-
 def sensor_null_shift_rad(gain_ratio: npt.ArrayLike, *, zone_rad: float = 9.3e-3) -> FloatArray:
     """Return how far the null of a shadow-bar sensor moves if its two elements differ [rad] (Edwards 20.1).
 
@@ -98,10 +68,3 @@ def sensor_null_shift_rad(gain_ratio: npt.ArrayLike, *, zone_rad: float = 9.3e-3
     gamma = as_float_array("gain_ratio", gain_ratio, ("...",), positive=True)
     # tan(a + β)/tan(a − β) = (sin 2a + sin 2β)/(sin 2a − sin 2β)
     return np.asarray(0.5 * np.arcsin(np.sin(zone_rad) * (gamma - 1.0) / (gamma + 1.0)))
-
-
-def cross_axis_error_rad(elevation_rad: npt.ArrayLike, azimuth_error_rad: npt.ArrayLike) -> FloatArray:
-    """Return the elevation error that an azimuth error makes, ¼ sin 2θ Δφ² [rad] (Edwards 20.2)."""
-    elevation = as_float_array("elevation_rad", elevation_rad, ("...",))
-    error = as_float_array("azimuth_error_rad", azimuth_error_rad, ("...",))
-    return np.asarray(0.25 * np.sin(2.0 * elevation) * error**2)

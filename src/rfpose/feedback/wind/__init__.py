@@ -8,7 +8,6 @@ from rfpose.feedback.wind.spectrum import (
     gust_spectrum,
     perfect_servo,
     rigidity_gain,
-    stowed_share,
     sunshine_deflection,
     wind_deflection,
 )
@@ -24,7 +23,6 @@ __all__ = [
     "read_wind_csv",
     "rigidity_gain",
     "stow_mask",
-    "stowed_share",
     "sunshine_deflection",
     "wind_bend",
     "wind_deflection",

@@ -55,11 +55,6 @@ class WindLoad:
         """x̄₁: what a steady wind of 1 m/s bends [rad]."""
         return self.torque_1mps_nm / self.stiffness_nm_per_rad
 
-    def torque_nm(self, speed_mps: npt.ArrayLike) -> FloatArray:
-        """Return the torque of winds (...) [N m]; NaN where the wind is unknown."""
-        speed = as_float_array("speed_mps", speed_mps, ("...",), finite=False)
-        return np.asarray(self.torque_1mps_nm * speed * np.abs(speed))
-
 
 def wind_bend(
     deflection_1mps_rad: float,

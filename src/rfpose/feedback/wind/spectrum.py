@@ -26,7 +26,6 @@ __all__ = [
     "gust_spectrum",
     "perfect_servo",
     "rigidity_gain",
-    "stowed_share",
     "sunshine_deflection",
     "wind_deflection",
 ]
@@ -180,8 +179,3 @@ def rigidity_gain(
     if with_servo == 0.0:
         raise InvalidInputError("`residual` leaves nothing; a servo has a finite bandwidth")
     return without / with_servo
-
-
-def stowed_share(*, stow_mps: float = STOW_MPS, mean_mps: float = MEAN_WIND_MPS) -> float:
-    """Return the part of sunny hours with more wind than mirrors are stowed at (Edwards 5.21)."""
-    return float(np.exp(-as_positive("stow_mps", stow_mps) / as_positive("mean_mps", mean_mps)))

@@ -45,10 +45,6 @@ class SiteBudget(Shown, Tabled):
     posture_names: tuple[str, ...]
     budget: ErrorBudget
 
-    def field_rms(self, values: FloatArray) -> float:
-        """Rms over heliostats and postures."""
-        return _rms(values)
-
     def by_heliostat(self, values: FloatArray) -> FloatArray:
         """(heliostat,) rms over the postures."""
         square = values.reshape(len(self.posture_names), -1) ** 2

@@ -15,10 +15,7 @@ from rfpose.feedback.tracking.live import LiveField, Moment, live_scenario
 from rfpose.pipeline.pictures.track_view import ON_RECEIVER, Instant, instant_at
 from rfpose.scenario import Scenario
 
-__all__ = ["DISTURBANCES", "LivePicture", "LiveTrack"]
-
-DISTURBANCES = ("gust", "kill_transmitter", "stop_motor", "emergency", "normal")
-"""What `LiveTrack.disturb` does; the second and third take a name."""
+__all__ = ["LivePicture", "LiveTrack"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +82,7 @@ class LiveTrack:
         self.step_s = self._field.step_s
 
     def disturb(self, what: str, name: str = "") -> None:
-        """Do one of `DISTURBANCES` before the next step.
+        """Do gust, kill_transmitter or stop_motor (which take a name), emergency or normal before the next step.
 
         Raises
         ------

@@ -73,11 +73,6 @@ class LayoutEdit:
         """Whether something was taken back."""
         return bool(self._redo)
 
-    @property
-    def is_changed(self) -> bool:
-        """Whether the layout differs from the scenario's."""
-        return self._now.transmitters != self.scenario.transmitter or self.pivot_enu_m is not None
-
     def find(self, name: str) -> Transmitter:
         """Return a transmitter by name."""
         for transmitter in self._now.transmitters:

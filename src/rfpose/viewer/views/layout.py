@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
@@ -57,8 +55,6 @@ __all__ = ["LayoutView"]
 _POSTURES = (("scenario", "as in the scenario"), ("sun", "reflecting the sun"), ("level", "level"))
 _HEIGHT_STEPS = 1000
 _PICK_PX = 16.0
-_RATE_OVER = 40
-"""Maps over which the rate shown is averaged."""
 
 
 class LayoutView(View):
@@ -75,7 +71,6 @@ class LayoutView(View):
         self._edit: LayoutEdit | None = None
         self._busy = self._again = self._filling = False
         self._handles: dict[str, Any] = {}
-        self._drawn: deque[float] = deque(maxlen=_RATE_OVER)
         self._limits: tuple[float, float] | None = None
         self._build()
         self.listen(session.opened, self._on_opened)
@@ -380,7 +375,6 @@ class LayoutView(View):
         if engine is None or edit is None:
             return
         self.map = found
-        self._drawn.append(time.monotonic())
         sigma = found.sigma_mrad
         known = sigma[np.isfinite(sigma)]
         if known.size and (self._limits is None or not self._limits[0] <= found.median_mrad <= self._limits[1]):
@@ -397,12 +391,6 @@ class LayoutView(View):
         self._show_figures(found)
         if self._again:
             self._ask_map()
-
-    def maps_per_s(self) -> float:
-        """Return how many maps a second were drawn, over the last ones; NaN before there are two."""
-        if len(self._drawn) < 2 or self._drawn[-1] == self._drawn[0]:
-            return float("nan")
-        return (len(self._drawn) - 1) / (self._drawn[-1] - self._drawn[0])
 
     def _show_figures(self, found: LiveMap) -> None:
         edit = self._edit
