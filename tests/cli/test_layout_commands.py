@@ -400,6 +400,7 @@ def test_plates_take_the_posture_of_the_field(tmp_path):
 def test_optimise_keeps_what_the_file_says(tmp_path, n):
     """Names, comments, [mirror], how numbers are written, a scale; only the transmitters are others."""
     text = SITE.read_text().replace('id = "T3"', 'id = "hill"  # on the hill', 1)
+    text = text.replace("carrier_hz = -18e6", "carrier_hz = -18.00e6", 1)
     text = text.replace('name = "Table 2', 'scale = 0.5  # half of it\nname = "Table 2', 1)
     text += '\n[[simulation.blocked]]\ntransmitter = "T10"\nreceivers = ["H01"]\n'
     site, better, picture = (tmp_path / name for name in ("site.toml", "better.toml", "both.svg"))
@@ -410,6 +411,7 @@ def test_optimise_keeps_what_the_file_says(tmp_path, n):
     assert "# on the hill" in now
     assert "# half of it" in now
     assert "frame_samples = 400_000" in now
+    assert ("carrier_hz = -18.00e6" in now) == (n == 9)  # eleven share the band anew
     assert then.transmitter_ids[:4] == ("T1", "T2", "hill", "T4")
     assert len(then.transmitter) == n
     assert then.heliostat == load_scenario(site).heliostat
