@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numba
 
-from rfpose.feedback.tracking import Simulation
+from rfpose.feedback.tracking import TrackingSimulation
 from rfpose.scenario import load_scenario
 
 SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
@@ -35,9 +35,9 @@ print((time.process_time() - start) / (4 * len(simulation.days[0].unix_s)))
 """
 
 
-def track(n: int, n_segment: int | None) -> tuple[float, float, Simulation]:
+def track(n: int, n_segment: int | None) -> tuple[float, float, TrackingSimulation]:
     """Seconds and seconds of processor a mirror and step, and the simulation."""
-    simulation = Simulation(load_scenario(SCENARIO), methods=("radio",), count=n, seed=1)
+    simulation = TrackingSimulation(load_scenario(SCENARIO), methods=("radio",), count=n, seed=1)
     simulation.advance()
     last = simulation.n_segment if n_segment is None else min(1 + n_segment, simulation.n_segment)
     steps = simulation.segments[last - 1].end - simulation.segments[0].end

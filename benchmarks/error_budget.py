@@ -18,7 +18,7 @@ import numpy as np
 
 from rfpose import geometry
 from rfpose.layout import maps
-from rfpose.layout.budget import ErrorBudget, error_budget, make_plan
+from rfpose.layout.budget import ErrorBudget, error_budget, working_point
 from rfpose.scenario import Scenario, load_scenario
 
 SITE = Path(__file__).resolve().parents[1] / "data" / "table2_100m.toml"
@@ -74,7 +74,7 @@ def main() -> None:
     n_draw = parser.parse_args().draws
     sun = geometry.enu_from_azimuth_elevation(*np.radians(SUN_DEG))
     for name, scenario in sites().items():
-        plan = make_plan(scenario, maps.mirrors_of(scenario, sun_enu=sun))
+        plan = working_point(scenario, maps.mirrors_of(scenario, sun_enu=sun))
         start = time.perf_counter()
         found = error_budget(plan, n_draw=n_draw, seed=1, aim_enu_m=scenario.site.aim_enu_m)
         show(name, found, time.perf_counter() - start)

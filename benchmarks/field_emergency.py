@@ -19,7 +19,7 @@ from rich.table import Table
 
 from rfpose.feedback.fieldcontrol.bus import BusSettings, capacity
 from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
-from rfpose.feedback.fieldcontrol.emergency import Field, Play, Receiver, play, ring_field
+from rfpose.feedback.fieldcontrol.emergency import EmergencyField, Play, TowerReceiver, play, ring_field
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S
 from rfpose.feedback.fieldcontrol.packets import RESOLUTION_RAD
@@ -32,14 +32,14 @@ START_S = -9.5
 EARTH_RAD_S = 2.0 * np.pi / 86400.0
 
 
-def make_field(n: int, rate_rad_s: float = PROTOTYPE_RATE_RAD_S) -> Field:
+def make_field(n: int, rate_rad_s: float = PROTOTYPE_RATE_RAD_S) -> EmergencyField:
     """Return rings about a tower."""
-    receiver = Receiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
-    return Field(pivot_enu_m=ring_field(n), receiver=receiver, rate_rad_s=rate_rad_s)
+    receiver = TowerReceiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
+    return EmergencyField(pivot_enu_m=ring_field(n), receiver=receiver, rate_rad_s=rate_rad_s)
 
 
 def run(
-    field: Field,
+    field: EmergencyField,
     bus: BusSettings,
     *,
     seed: int,

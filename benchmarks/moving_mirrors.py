@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.tracking import Motion, TrackedPoses, track_poses
+from rfpose.multilat.filtering import FilteredPoses, FilterSettings, filter_poses
 
 Array = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def simulate(rng: np.random.Generator, n_frame: int, n_mirror: int, walk: float)
     return np.array(true), np.array(measured), PIVOT_SIGMA_M * rng.standard_normal((n_frame, n_mirror, 3))
 
 
-def errors(found: TrackedPoses, true: Array, frame: int) -> tuple[float, float]:
+def errors(found: FilteredPoses, true: Array, frame: int) -> tuple[float, float]:
     """Return the rms angle of the normal [mrad], and NEES of the rotation."""
     left = Rotation.from_matrix(true[frame] @ found.rot_enu_from_mirror[frame].swapaxes(1, 2)).as_rotvec()
     cov = found.cov[frame][:, 3:6, 3:6]
@@ -63,14 +63,14 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for walk in (1e-7, 1e-6, 1e-5):
         true, measured, pivot = simulate(np.random.default_rng(1), n_frame, n, walk)
-        motion = Motion(rate_walk_radps_per_sqrt_s=walk, rate_sigma_radps=7e-5)
+        motion = FilterSettings(rate_walk_radps_per_sqrt_s=walk, rate_sigma_radps=7e-5)
         single = 1e3 * np.sqrt(np.mean(np.sum((measured[-1] - true[-1])[:, :, 2] ** 2, axis=1)))
-        filtered, nees = errors(track_poses(pivot, measured, cov, time_s=at, motion=motion), true, n_frame - 1)
+        filtered, nees = errors(filter_poses(pivot, measured, cov, time_s=at, motion=motion), true, n_frame - 1)
         measured[-12:] = np.nan
-        coasted, coasted_nees = errors(track_poses(pivot, measured, cov, time_s=at, motion=motion), true, n_frame - 1)
+        coasted, coasted_nees = errors(filter_poses(pivot, measured, cov, time_s=at, motion=motion), true, n_frame - 1)
         print(f"| {walk:g} | {single:.3f} | {filtered:.3f} | {nees:.3f} | {coasted:.3f} | {coasted_nees:.3f} |")
     begun = time.perf_counter()
-    track_poses(pivot, measured, cov, time_s=at)
+    filter_poses(pivot, measured, cov, time_s=at)
     print(f"\n{1e6 * (time.perf_counter() - begun) / (n * n_frame):.2f} µs a mirror and frame")
 
 

@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 from rfpose.feedback.servo import PiLaw, run_loop
 from rfpose.feedback.servo.margins import design_law
 from rfpose.feedback.structure import EDWARDS_MODE, Structure, plate_mode_hz
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.feedback.tracking.budget import SampledLoop, track_budget
 from rfpose.feedback.wind import perfect_servo, rigidity_gain, sunshine_deflection
 from rfpose.feedback.wind.spectrum import wind_deflection
@@ -65,7 +65,7 @@ def field(hours: Sequence[float], wind_mps: float, mode_hz: float, interval_s: f
 
 def rms_mrad(scenario: Scenario, method: str, mirrors: int) -> float:
     """Return the simulated rms, for open loop without the mean deflection."""
-    simulation = Simulation(scenario, methods=(method,), count=mirrors, seed=1)
+    simulation = TrackingSimulation(scenario, methods=(method,), count=mirrors, seed=1)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     square = score(simulation.sums(method)).normal_rms_rad ** 2

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rfpose.feedback.tracking import Score, Simulation, score
+from rfpose.feedback.tracking import Score, TrackingSimulation, score
 from rfpose.feedback.tracking.budget import Budget, track_budget
 from rfpose.scenario import Scenario, load_scenario
 
@@ -80,7 +80,7 @@ def changed(hours: Sequence[float], *changes: Change) -> Scenario:
 
 def simulated(scenario: Scenario, methods: Sequence[str], mirrors: int, seed: int) -> dict[str, Score]:
     """Return scores by method."""
-    simulation = Simulation(scenario, methods=methods, count=mirrors, seed=seed)
+    simulation = TrackingSimulation(scenario, methods=methods, count=mirrors, seed=seed)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return {m.name: score(simulation.sums(m.name)) for m in simulation.methods}

@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.scenario import Scenario, load_scenario
 
 SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
@@ -68,7 +68,7 @@ def main() -> None:
     print("|---|" + "---|" * (len(METHODS) + 1))
     for name, change, mirror in CASES:
         scenario = changed(base, change, mirror, tuple(arguments.hours))
-        simulation = Simulation(scenario, methods=METHODS, count=arguments.mirrors, seed=1)
+        simulation = TrackingSimulation(scenario, methods=METHODS, count=arguments.mirrors, seed=1)
         while simulation.done < simulation.n_segment:
             simulation.advance()
         rms = {m: 1e3 * score(simulation.sums(m)).normal_rms_rad for m in METHODS}

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from rfpose.feedback.fieldcontrol.bus import BusSettings
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.diagram import draw_modes
-from rfpose.feedback.fieldcontrol.emergency import Field, Play, Receiver, play, ring_field
+from rfpose.feedback.fieldcontrol.emergency import EmergencyField, Play, TowerReceiver, play, ring_field
 from rfpose.feedback.fieldcontrol.modes import Mode, dot
 from rfpose.sun import Site, sun_position, unix_seconds
 
@@ -25,8 +25,8 @@ COLOURS = {Mode.TRACK: "#E69F00", Mode.EMERGENCY: "#D55E00", Mode.STOWING: "#56B
 
 def emergency(n: int, seed: int) -> Play:
     """Play an alarm at 0 s with one message in twenty lost and the innermost cluster dead."""
-    receiver = Receiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
-    field = Field(pivot_enu_m=ring_field(n), receiver=receiver)
+    receiver = TowerReceiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
+    field = EmergencyField(pivot_enu_m=ring_field(n), receiver=receiver)
     control = FieldControl(
         aim_enu_m=receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import rfpose as rf
 from rfpose.drawing import save_figure
-from rfpose.feedback.tracking import Simulation
+from rfpose.feedback.tracking import TrackingSimulation
 from rfpose.pipeline.track import TrackChanges
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +42,7 @@ def draw_outage(path: Path) -> None:
         tracking={"first_hour": 9.5, "last_hour": 13.0, "radio": {"outages": [outage]}}
     )
     methods = ("camera-model", "radio", "radio-model", "radio-both")
-    simulation = Simulation(scenario, methods=methods, seed=0)
+    simulation = TrackingSimulation(scenario, methods=methods, seed=0)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     hour = simulation.days[0].hour[:: round(scenario.tracking.store_interval_s)]

@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 from rfpose import geometry
 from rfpose.cli._app import app
 from rfpose.feedback.calibration import fit
-from rfpose.feedback.camera.render import Beam, Target, View, render
+from rfpose.feedback.camera.render import Beam, CameraView, Target, render
 from rfpose.feedback.drone import Drone, fly
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
@@ -82,7 +82,7 @@ def _take_pictures(folder: Path) -> None:
             beams = ()
         if i == 7:
             beams = (Beam(centre_m=(-0.45, 0.3)), Beam(centre_m=(0.5, -0.3)))
-        io.imsave(folder / f"{i}.png", render(Target(), View(), beams, rng=rng), check_contrast=False)
+        io.imsave(folder / f"{i}.png", render(Target(), CameraView(), beams, rng=rng), check_contrast=False)
         rows.append([f"{i}.png", _iso(unix_s), "A1", *count])
     _table(folder / "pictures.csv", "file,time_utc,heliostat,axis_1,axis_2", rows)
     (folder / "board.toml").write_text(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from rfpose.cli._support import Session
+from rfpose.cli._support import CommonOptions
 from rfpose.cli.layout import command
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.geometry import enu_from_azimuth_elevation, unit
@@ -32,7 +32,7 @@ SITE = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 
 
 def run(*arguments):
-    result = CliRunner().invoke(command, [str(a) for a in arguments], obj=Session())
+    result = CliRunner().invoke(command, [str(a) for a in arguments], obj=CommonOptions())
     assert result.exit_code == 0, result.output
     return result.stdout
 
@@ -274,7 +274,7 @@ def test_ground_by_outline_and_circles(tmp_path):
     ],
 )
 def test_options_that_contradict_are_refused(arguments, text):
-    result = CliRunner().invoke(command, [str(a) for a in arguments], obj=Session())
+    result = CliRunner().invoke(command, [str(a) for a in arguments], obj=CommonOptions())
     assert result.exit_code == 2
     assert text in result.output
 

@@ -13,7 +13,7 @@ import tomli_w
 
 from damage import as_json, copied, damage_bytes, damage_hdf5, damage_values
 from rfpose.errors import RecordingError, RfposeError, ScenarioError
-from rfpose.feedback.camera.render import Beam, Target, View, render
+from rfpose.feedback.camera.render import Beam, CameraView, Target, render
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import read_heliostat
 from rfpose.feedback.series import Quantity, read_series_csv
@@ -371,7 +371,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from skimage import io
 
     folder = tmp_path_factory.mktemp("pictures")
-    picture = render(Target(), View(), (Beam(centre_m=(0.2, 0.1)),), rng=np.random.default_rng(1))
+    picture = render(Target(), CameraView(), (Beam(centre_m=(0.2, 0.1)),), rng=np.random.default_rng(1))
     io.imsave(folder / "1.png", picture, check_contrast=False)
     (folder / "pictures.csv").write_text(
         "file,time_utc,heliostat,axis_1,axis_2\n1.png,2026-06-21T08:00:00Z,A,0.1,0.3\n"

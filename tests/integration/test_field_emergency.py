@@ -6,7 +6,7 @@ import pytest
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings
 from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
-from rfpose.feedback.fieldcontrol.emergency import Field, Receiver, play, ring_field, share_on_receiver
+from rfpose.feedback.fieldcontrol.emergency import EmergencyField, TowerReceiver, play, ring_field, share_on_receiver
 from rfpose.feedback.fieldcontrol.modes import Event, Mode
 from rfpose.geometry import bisector_enu, rot_enu_from_mirror, unit
 from rfpose.sun import Site, sun_position, unix_seconds
@@ -16,8 +16,8 @@ SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 
 
 def _field(n, **changes):
-    receiver = Receiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
-    return Field(pivot_enu_m=ring_field(n), receiver=receiver, **changes)
+    receiver = TowerReceiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
+    return EmergencyField(pivot_enu_m=ring_field(n), receiver=receiver, **changes)
 
 
 def _play(field, times, *, happenings, mode=Mode.TRACK, bus=None, settings=None, wind_mps=0.0, seed=1):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfpose.errors import InvalidInputError, ScenarioError
-from rfpose.multilat import TrackStatus
+from rfpose.multilat import FilterStatus
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result import Result
@@ -83,8 +83,8 @@ def test_outages_are_bridged_with_a_growing_sigma(result: Result) -> None:
     table, truth = result.filtered, result.truth
     assert table is not None
     assert truth is not None
-    assert np.all(table.status[0] == TrackStatus.STARTED)
-    assert np.all(table.status[LOST, 0] == TrackStatus.COASTED)
+    assert np.all(table.status[0] == FilterStatus.STARTED)
+    assert np.all(table.status[LOST, 0] == FilterStatus.COASTED)
     assert np.all(np.isnan(result.poses.sigma_rad[LOST, 0]))
     sigma = table.sigma_rad[LOST, 0]
     assert np.all(np.diff(sigma) > 0.0)
@@ -94,7 +94,7 @@ def test_outages_are_bridged_with_a_growing_sigma(result: Result) -> None:
     turned = np.linalg.norm(truth.normal_enu[LOST.stop - 1, 0] - truth.normal_enu[LOST.start - 1, 0])
     assert turned > 3.0 * off[-1]
     summary = summarise(result)["filtered"]["reasons"]
-    assert summary[TrackStatus.COASTED.reason] >= LOST.stop - LOST.start
+    assert summary[FilterStatus.COASTED.reason] >= LOST.stop - LOST.start
 
 
 def test_the_command_line_wins_over_the_scenario() -> None:

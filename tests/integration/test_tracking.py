@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfpose.errors import ScenarioError
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.scenario import load_scenario
 from sites import PERFECT
 
@@ -27,7 +27,7 @@ def scenario(*changes, **tracking):
 
 
 def run(site, methods, *, count=None, seed=1):
-    simulation = Simulation(site, methods=methods, count=count, seed=seed)
+    simulation = TrackingSimulation(site, methods=methods, count=count, seed=seed)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return simulation
@@ -121,7 +121,7 @@ def test_an_unreachable_aim_point_is_told():
     part = score(run(low, ("open-loop",)).sums("open-loop")).out_of_reach
     assert 0.1 < part < 1.0
     with pytest.raises(ScenarioError, match=r"no mirror reaches its aim point.*beyond its limits"):
-        Simulation(scenario(drive={"elevation_limits_deg": (-5.0, 0.0)}), methods=("open-loop",))
+        TrackingSimulation(scenario(drive={"elevation_limits_deg": (-5.0, 0.0)}), methods=("open-loop",))
 
 
 def test_dishes_follow_the_sun():
@@ -143,10 +143,10 @@ def test_what_a_method_meets_does_not_depend_on_its_company(default_hour):
 
 
 def test_a_restored_run_goes_on_as_if_nothing_had_happened(default_hour):
-    first = Simulation(scenario(), seed=1)
+    first = TrackingSimulation(scenario(), seed=1)
     first.advance()
     kept = {name: values.copy() for name, values in first.state().items()}
-    second = Simulation(scenario(), seed=1)
+    second = TrackingSimulation(scenario(), seed=1)
     second.restore(kept)
     while second.done < second.n_segment:
         second.advance()

@@ -11,7 +11,7 @@ from rfpose.cli.track import _event
 from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
-from rfpose.feedback.tracking import Simulation, operation, score
+from rfpose.feedback.tracking import TrackingSimulation, operation, score
 from rfpose.scenario import load_scenario
 from sites import PERFECT
 
@@ -41,7 +41,7 @@ def scenario(*changes, events=(), bus=None, without=False, **tracking):
 
 
 def run(site, methods=("open-loop",), *, count=3, seed=1):
-    simulation = Simulation(site, methods=methods, count=count, seed=seed)
+    simulation = TrackingSimulation(site, methods=methods, count=count, seed=seed)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return simulation
@@ -377,7 +377,7 @@ def test_motors_without_power_do_not_turn(powerless):
 
 def test_strong_and_unknown_wind_stow_the_field(tmp_path):
     base = scenario(HALF_HOUR, first_hour=11.25, last_hour=12.25)
-    first = Simulation(base, methods=("open-loop",), count=3).days[0]
+    first = TrackingSimulation(base, methods=("open-loop",), count=3).days[0]
     time = np.arange(np.floor(first.unix_s[0]) - 60.0, first.unix_s[-1] + 60.0)
     hour = 11.25 + (time - first.unix_s[0]) / 3600.0
     speed = np.where((hour >= 11.4) & (hour < 11.5), 12.0, 4.0)
@@ -595,14 +595,14 @@ def test_killed_and_taken_up_again_nothing_changes(events, amid):
         HALF_HOUR, {"store_interval_s": 60.0, "field_control": {"homing_sigma_mrad": 150.0}}, events=events,
         bus={"lost": 0.1},
     )  # fmt: skip
-    whole = Simulation(site, methods=("open-loop", "radio-both"), count=3, seed=1)
+    whole = TrackingSimulation(site, methods=("open-loop", "radio-both"), count=3, seed=1)
     whole.advance()
     kept = through_a_file(whole.state())
     (mode,) = (values for name, values in kept.items() if name.endswith("open-loop/operation/control.heliostats.mode"))
     assert amid in mode
     while whole.done < whole.n_segment:
         whole.advance()
-    second = Simulation(site, methods=("open-loop", "radio-both"), count=3, seed=1)
+    second = TrackingSimulation(site, methods=("open-loop", "radio-both"), count=3, seed=1)
     second.restore(kept)
     same_bytes(second.state(), kept)
     while second.done < second.n_segment:

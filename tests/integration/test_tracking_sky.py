@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfpose.feedback.energy import draw_bursts
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import days
 from rfpose.scenario import load_scenario
@@ -25,7 +25,7 @@ def scenario(**tracking):
 
 
 def run(site, methods, *, seed=CLOUDY):
-    simulation = Simulation(site, methods=methods, count=3, seed=seed)
+    simulation = TrackingSimulation(site, methods=methods, count=3, seed=seed)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return simulation
@@ -97,10 +97,10 @@ def test_a_servo_that_needs_the_sun_pays_for_every_burst(dishes):
 def test_taken_up_again_amid_clouds_nothing_changes():
     site = scenario(collector="dish")
     whole = run(site, ("sun-sensor",))
-    first = Simulation(site, methods=("sun-sensor",), count=3, seed=CLOUDY)
+    first = TrackingSimulation(site, methods=("sun-sensor",), count=3, seed=CLOUDY)
     for _ in range(2):
         first.advance()
-    second = Simulation(site, methods=("sun-sensor",), count=3, seed=CLOUDY)
+    second = TrackingSimulation(site, methods=("sun-sensor",), count=3, seed=CLOUDY)
     second.restore({name: values.copy() for name, values in first.state().items()})
     while second.done < second.n_segment:
         second.advance()

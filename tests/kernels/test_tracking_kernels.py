@@ -9,7 +9,7 @@ import numpy as np
 
 from rfpose.feedback.columns import PARAMETERS, constant
 from rfpose.feedback.mount import Actuator, Mount, posture
-from rfpose.feedback.tracking import Simulation
+from rfpose.feedback.tracking import TrackingSimulation
 from rfpose.scenario import Scenario, load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,7 +85,7 @@ def test_mirrors_stand_as_their_mounts_say_by_the_names_of_parameters():
         "mount_errors": {"thermal_sigma_mrad": 3.0, "sag_sigma_mrad": 2.0, "worm_sigma_mrad": 2.0},
     }  # fmt: skip
     del data["tracking"]["field_control"]
-    simulation = Simulation(Scenario.model_validate(data), methods=("open-loop",), count=3, seed=2)
+    simulation = TrackingSimulation(Scenario.model_validate(data), methods=("open-loop",), count=3, seed=2)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     field, day, curves = simulation.field, simulation.days[0], simulation.curves("open-loop")

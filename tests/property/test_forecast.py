@@ -8,7 +8,7 @@ import pytest
 from rfpose import geometry
 from rfpose.dsp import TonePhases
 from rfpose.layout import maps
-from rfpose.layout.budget import make_plan, noise_bound
+from rfpose.layout.budget import noise_bound, working_point
 from rfpose.measurement import SCENARIO
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.ground import Reflector, range_shift_m
@@ -160,7 +160,7 @@ def test_the_forecast_is_what_process_states(ground: str, centre_hz: float, seed
     chosen = {"sample_rate": "64e6", "estimator": "correlator"}
     found = solve(tones, scenario, settings=chosen | {"pose": "rigid"})
     assert found.integrity is not None
-    plan = make_plan(scenario, mirrors)
+    plan = working_point(scenario, mirrors)
     # a pose that rests on less than all phases states more
     whole = (found.poses.status == PoseStatus.OK)[0] & (found.integrity.status == IntegrityStatus.OK)[0]
     whole &= found.poses.n_wavelength[0] == len(plan.waves.tone)
@@ -173,4 +173,4 @@ def test_the_forecast_is_what_process_states(ground: str, centre_hz: float, seed
     if scenario.calibration_receiver:
         stated = solve(tones, scenario, settings=chosen | {"pose": "independent"}).poses.sigma_rad[0]
         np.testing.assert_allclose(maps.study_of(scenario, "independent").bound(mirrors), stated, rtol=0.05)
-        np.testing.assert_allclose(noise_bound(make_plan(scenario, mirrors, pose="independent")), stated, rtol=0.05)
+        np.testing.assert_allclose(noise_bound(working_point(scenario, mirrors, pose="independent")), stated, rtol=0.05)

@@ -15,7 +15,7 @@ from rfpose.feedback.camera.berenguel import (
     find_target_px,
     step_mm,
 )
-from rfpose.feedback.camera.render import Beam, Disturbance, Target, View, project_px, render
+from rfpose.feedback.camera.render import Beam, CameraView, Disturbance, Target, project_px, render
 from rfpose.feedback.camera.search import neighbour_zones_m, search
 from rfpose.feedback.camera.spot import SpotStatus
 from rfpose.feedback.mount import Actuator, Mount, command, posture
@@ -33,7 +33,7 @@ HELIOSTATS = [(-40.0, 70.0, 0.0), (25.0, 95.0, 1.0), (-60.0, 120.0, 2.0), (5.0, 
 def view(*, aim_m=(0.0, 0.0), roll_rad=0.0):
     """His camera: 18.5 mm a pixel, its line of sight 0.35 rad up against a target that leans 0.61 rad down."""
     away, lean = 100.0, 0.61 - 0.35
-    return View(
+    return CameraView(
         right_m=0.0, up_m=-away * np.sin(lean), front_m=away * np.cos(lean), focal_px=away / 18.5e-3,
         shape_px=(576, 768), aim_m=aim_m, roll_rad=roll_rad,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.scenario import load_scenario
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "tracking_100m.toml"
@@ -43,7 +43,7 @@ def malan(*, worm_rad=0.0, fit_worm=False):
 
 
 def rms_mrad(scenario, method):
-    simulation = Simulation(scenario, methods=(method,), seed=3)
+    simulation = TrackingSimulation(scenario, methods=(method,), seed=3)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return score(simulation.sums(method)).as_dict()

@@ -18,7 +18,7 @@ from rfpose.pipeline.pictures.field_view import history, project
 from rfpose.scenario import Scenario, load_scenario, parse_scenario
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 from rfpose.viewer.state.playback import Playback
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.state.settings import Settings
@@ -35,7 +35,7 @@ def test_state_and_the_package_load_no_qt() -> None:
 
 def test_event_reaches_those_who_still_listen() -> None:
     heard: list[str] = []
-    event = Event()
+    event = Signal()
     leave = event.connect(lambda: (heard.append("a"), leave_b()))
     leave_b = event.connect(lambda: heard.append("b"))
     event.emit()

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import click
 
 from rfpose import __version__, interruption
-from rfpose.cli._support import Session, emit_json, in_options
+from rfpose.cli._support import CommonOptions, emit_json, in_options
 from rfpose.errors import RfposeError
 from rfpose.files import release_all
 
@@ -64,7 +64,7 @@ class _LazyGroup(click.Group):
             raise click.exceptions.Exit(EXIT_INTERRUPTED) from None
 
     def invoke(self, ctx: click.Context) -> Any:
-        session = ctx.ensure_object(Session)
+        session = ctx.ensure_object(CommonOptions)
         try:
             with interruption.heard(), _notes_to_stderr():
                 return super().invoke(ctx)
@@ -115,7 +115,7 @@ def _leave(ctx: click.Context, message: str) -> NoReturn:
         ctx.exit(EXIT_INTERRUPTED)
 
 
-def _fail(ctx: click.Context, session: Session, message: str, code: int) -> NoReturn:
+def _fail(ctx: click.Context, session: CommonOptions, message: str, code: int) -> NoReturn:
     """Print one line (and the traceback if asked for), give the JSON reader its object, and leave."""
     if session.debug:
         click.echo(traceback.format_exc(), err=True)

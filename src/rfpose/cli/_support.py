@@ -21,8 +21,8 @@ from rfpose.files import claim
 from rfpose.shown import plain
 
 __all__ = [
+    "CommonOptions",
     "Progress",
-    "Session",
     "check_directory",
     "check_ending",
     "check_readable",
@@ -48,7 +48,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 @dataclass
-class Session:
+class CommonOptions:
     """What the common options said; it reaches the error handler even when a command fails."""
 
     debug: bool = False
@@ -62,7 +62,7 @@ def common_options(function: F) -> F:
     """Add ``--json`` and ``--debug`` to a command."""
 
     def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-        session = ctx.ensure_object(Session)
+        session = ctx.ensure_object(CommonOptions)
         session.options = {str(each.name): each for each in ctx.command.params}
         setattr(session, str(parameter.name), value)
 
@@ -128,7 +128,7 @@ def examples(*lines: str) -> str:
 
 def wants_json() -> bool:
     """Tell whether the running command was asked for JSON."""
-    return click.get_current_context().ensure_object(Session).json
+    return click.get_current_context().ensure_object(CommonOptions).json
 
 
 def emit_json(data: Mapping[str, Any]) -> None:
@@ -168,7 +168,7 @@ def outputs(
         yield
     written = [path for path in paths if path is not None]
     if written:
-        click.get_current_context().ensure_object(Session).when_interrupted = when_written(*written)
+        click.get_current_context().ensure_object(CommonOptions).when_interrupted = when_written(*written)
 
 
 def when_written(*paths: Path) -> str:

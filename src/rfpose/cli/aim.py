@@ -24,7 +24,7 @@ from rfpose.cli._support import (
 )
 
 if TYPE_CHECKING:
-    from rfpose.pipeline.aim import Plan
+    from rfpose.pipeline.aim import CommandPlan
 
 __all__ = ["command"]
 
@@ -92,7 +92,7 @@ def command(model: Path, dish: bool, wanted: _Wanted, output: Path | None, force
         say(f"wrote {output}")
 
 
-def _plans(model: Path, wanted: _Wanted) -> tuple[Plan, ...]:
+def _plans(model: Path, wanted: _Wanted) -> tuple[CommandPlan, ...]:
     """Plan what the options name."""
     from rfpose.pipeline.aim import plan_commands
     from rfpose.sun import site_from_degrees
@@ -101,7 +101,7 @@ def _plans(model: Path, wanted: _Wanted) -> tuple[Plan, ...]:
     return plan_commands(model, **(asdict(wanted) | {"site": place}))
 
 
-def _show(plan: Plan) -> None:
+def _show(plan: CommandPlan) -> None:
     """Print commands, the year, and what to measure next."""
     told = plan.as_dict()
     rows = [

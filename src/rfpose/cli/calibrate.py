@@ -11,7 +11,7 @@ import click
 
 import rfpose
 from rfpose.cli._support import (
-    Session,
+    CommonOptions,
     check_directory,
     check_ending,
     check_there,
@@ -181,7 +181,7 @@ def _show(reports: Calibrations) -> None:
         for group in item["undetermined"]:
             say(f"  undetermined, the data cannot tell apart: {', '.join(group)}")
         for note in item["notes"]:
-            say(f"  note: {in_options(note, click.get_current_context().ensure_object(Session).options)}")
+            say(f"  note: {in_options(note, click.get_current_context().ensure_object(CommonOptions).options)}")
         if "PAINT" in item["sources"] or item is plain[-1]:
             for number, reason in list(item["skipped"].items())[:_SHOWN_ALARMS]:
                 say(f"  record {number} left out: {reason}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from rfpose.cli._support import (
-    Session,
+    CommonOptions,
     common_options,
     emit_json,
     examples,
@@ -35,7 +35,7 @@ __all__ = ["command", "write_report"]
 @force_option
 @common_options
 @click.pass_obj
-def command(session: Session, output: Path, seed: int, force: bool) -> None:
+def command(session: CommonOptions, output: Path, seed: int, force: bool) -> None:
     """Simulate a field of 12 heliostats, process the recording, evaluate it, draw it and write a report."""
     from rfpose.pipeline.demo import run_demo
 

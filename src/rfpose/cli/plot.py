@@ -76,10 +76,10 @@ def command(
     with outputs(output, inputs=[file, truth], force=force), progress("Drawing"):
         check_there(file, truth)
         from rfpose.drawing import look, save_figure
-        from rfpose.pipeline.pictures.catalogue import Choice, draw, opened_file
+        from rfpose.pipeline.pictures.catalogue import FigureChoice, draw, opened_file
 
         with opened_file(file, truth=truth, follow_links=follow_links) as opened, look(theme):  # type: ignore[arg-type]
-            save_figure(draw(opened, what, Choice(**chosen)), output)  # type: ignore[arg-type]
+            save_figure(draw(opened, what, FigureChoice(**chosen)), output)  # type: ignore[arg-type]
     if wants_json():
         emit_json({"file": file, "what": what, "output": output})
     else:

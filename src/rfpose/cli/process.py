@@ -11,7 +11,7 @@ import click
 
 import rfpose
 from rfpose.cli._support import (
-    Session,
+    CommonOptions,
     check_table,
     common_options,
     emit_json,
@@ -116,7 +116,7 @@ class _Tables:
 @gathered("tables", _Tables)
 @click.pass_obj
 def command(
-    session: Session,
+    session: CommonOptions,
     recording: Path,
     output: Path,
     scenario: Path | None,

@@ -10,7 +10,7 @@ import click
 
 import rfpose
 from rfpose.cli._support import (
-    Session,
+    CommonOptions,
     check_ending,
     check_table,
     common_options,
@@ -142,7 +142,7 @@ def _names(_ctx: click.Context, _option: click.Parameter, text: str | None) -> t
 @gathered("files", _Files)
 @click.pass_obj
 def command(
-    session: Session,
+    session: CommonOptions,
     scenario: Path,
     output: Path,
     methods: tuple[str, ...],

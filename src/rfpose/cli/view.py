@@ -107,10 +107,10 @@ def command(
             shown = "report"
         else:
             from rfpose.drawing import look, save_figure
-            from rfpose.pipeline.pictures.catalogue import Choice, draw, opened_file
+            from rfpose.pipeline.pictures.catalogue import FigureChoice, draw, opened_file
 
             source = _recording_of(file) if view == "recording" else file
-            chosen_one = Choice(frame=next(iter(frames), None), heliostat=next(iter(heliostats), None))
+            chosen_one = FigureChoice(frame=next(iter(frames), None), heliostat=next(iter(heliostats), None))
             with opened_file(source, scenario=scenario, follow_links=follow_links) as opened:
                 shown, what = _figure(opened.kind, view)
                 with look("dark" if theme == "dark" else "light"):

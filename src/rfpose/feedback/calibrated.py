@@ -19,11 +19,11 @@ __all__ = [
     "LEAST_REDUNDANCY",
     "PARAMETER_SETS",
     "Calibration",
-    "Choice",
     "FieldCalibration",
     "FitSettings",
     "FitStatus",
     "Known",
+    "ParameterChoice",
     "RowStatus",
     "resolve_free",
 ]
@@ -208,7 +208,7 @@ class FieldCalibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class ParameterChoice:
     """Which set of parameters was chosen for a heliostat, and why.
 
     Attributes
@@ -262,7 +262,7 @@ class Calibration:
     row_status: npt.NDArray[np.int8]
     error_rad: FloatArray
     settings: FitSettings
-    choice: Choice | None = None
+    choice: ParameterChoice | None = None
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -333,7 +333,7 @@ class Known(Protocol):
     @property
     def noise_assumed(self) -> bool: ...  # noqa: D102
     @property
-    def choice(self) -> Choice | None: ...  # noqa: D102
+    def choice(self) -> ParameterChoice | None: ...  # noqa: D102
 
 
 def resolve_free(free: str | Sequence[str]) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from rfpose.geometry import enu_from_wgs84
 from rfpose.paint import heliostat_place, key_of, origin_of, place_of, properties_of, read_object
 from rfpose.sun import Site, unix_seconds
 
-__all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "Target", "heliostat_ids", "read_heliostat"]
+__all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "PaintTarget", "heliostat_ids", "read_heliostat"]
 
 ALGORITHMS = ("HeliOS", "UTIS")
 CHOICES = ("both", "any", *ALGORITHMS)
@@ -52,7 +52,7 @@ _FARTHEST_M = 1e5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
+class PaintTarget:
     """A plane calibration target.
 
     Attributes
@@ -121,7 +121,7 @@ class PaintHeliostat:
     id: str
     mount: Mount
     site: Site
-    targets: Mapping[str, Target]
+    targets: Mapping[str, PaintTarget]
     record_ids: npt.NDArray[np.int64]
     unix_s: FloatArray
     count: FloatArray
@@ -256,7 +256,7 @@ class _Record:
     target: str
 
 
-def _record(number: int, file: Path, targets: Mapping[str, Target], origin: FloatArray, algorithm: str) -> _Record:
+def _record(number: int, file: Path, targets: Mapping[str, PaintTarget], origin: FloatArray, algorithm: str) -> _Record:
     """Read a record, or say why it cannot be used."""
     record = read_object(file)
     spots = enu_from_wgs84([place_of(*spot) for spot in _spots(record, file, algorithm)], origin)
@@ -347,7 +347,7 @@ def _moment(text: Any, where: str) -> float:
         raise RecordingError(f"{where}: {error}") from error
 
 
-def _targets(tower: Mapping[str, Any], path: Path, origin: FloatArray) -> dict[str, Target]:
+def _targets(tower: Mapping[str, Any], path: Path, origin: FloatArray) -> dict[str, PaintTarget]:
     """Plane targets of the tower."""
     return {
         name: _target(entry, path, name, origin)
@@ -356,7 +356,7 @@ def _targets(tower: Mapping[str, Any], path: Path, origin: FloatArray) -> dict[s
     }
 
 
-def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray) -> Target:
+def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray) -> PaintTarget:
     """Plane through a target's corners; ``normal_vector`` only says which side is its front.
 
     PAINT's is grid north for every target, 2.8 to 5.5 mrad off the plane of the corners.
@@ -373,12 +373,12 @@ def _target(entry: Mapping[str, Any], path: Path, name: str, origin: FloatArray)
     if not np.isfinite(normal).all():
         raise RecordingError(f"{path}: {name}.normal_vector: must have a direction, got {front!r:.40}")
     if not places:
-        return Target(centre_enu_m=centre, normal_enu=normal)
+        return PaintTarget(centre_enu_m=centre, normal_enu=normal)
     corners = enu_from_wgs84(list(places.values()), origin)
     _, size, axes = np.linalg.svd(corners - corners.mean(axis=0))
     if len(corners) > 2 and size[1] > 0.1:  # metres: corners in a line span no plane
         normal = axes[2] * (1.0 if axes[2] @ normal > 0.0 else -1.0)
-    return Target(
+    return PaintTarget(
         centre_enu_m=centre, normal_enu=normal, reach_m=float(np.linalg.norm(corners - centre, axis=-1).max())
     )
 

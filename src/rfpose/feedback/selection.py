@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
-from rfpose.feedback.calibrated import PARAMETER_SETS, Calibration, Choice, FieldCalibration, FitSettings
+from rfpose.feedback.calibrated import PARAMETER_SETS, Calibration, FieldCalibration, FitSettings, ParameterChoice
 from rfpose.feedback.calibration import fit, row_status, solve
 from rfpose.feedback.columns import columns_of
 from rfpose.feedback.measurements import Measurements
@@ -112,7 +112,7 @@ def choose(
     *,
     also: Sequence[str] = (),
     settings: FitSettings | None = None,
-) -> tuple[Choice, ...]:
+) -> tuple[ParameterChoice, ...]:
     """Choose parameters for each of several selections of a heliostat's measurements.
 
     Parameters
@@ -146,7 +146,7 @@ def held_out_sigma(
 ) -> float:
     """Scatter of time-blocks predicted from the others, in units of the stated sigma, for parameters that are given.
 
-    To be held against `Choice.held_out_sigma`. NaN where there are too few measurements.
+    To be held against `ParameterChoice.held_out_sigma`. NaN where there are too few measurements.
     """
     held = _folds(measurements, row_status(mount, measurements) == 0)
     if not len(held):
@@ -185,13 +185,15 @@ def _folds(measurements: Measurements, mask: npt.NDArray[np.bool_]) -> npt.NDArr
     return folds
 
 
-def _choice(sets: Mapping[str, tuple[str, ...]], errors: Mapping[str, FloatArray], sigma_rad: FloatArray) -> Choice:
+def _choice(
+    sets: Mapping[str, tuple[str, ...]], errors: Mapping[str, FloatArray], sigma_rad: FloatArray
+) -> ParameterChoice:
     """Smallest set that predicts as well as the best, to within a fiftieth."""
     held = {name: error[np.isfinite(error)] for name, error in errors.items()}
     n = min(len(error) for error in held.values())
     smallest = next(iter(sets))
     if n < 2 or len({len(error) for error in held.values()}) > 1:
-        return Choice(
+        return ParameterChoice(
             chosen=smallest,
             free=sets[smallest],
             held_out_rad={},
@@ -213,7 +215,7 @@ def _choice(sets: Mapping[str, tuple[str, ...]], errors: Mapping[str, FloatArray
         else f"{told}, as good as {best} ({1e3 * mean[best]:.2f}), with fewer parameters"
     )
     scatter = float(np.nanmedian(errors[name] / sigma_rad)) / RAYLEIGH_MEDIAN
-    return Choice(chosen=name, free=sets[name], held_out_rad=mean, held_out_sigma=scatter, reason=reason)
+    return ParameterChoice(chosen=name, free=sets[name], held_out_rad=mean, held_out_sigma=scatter, reason=reason)
 
 
 def refit(

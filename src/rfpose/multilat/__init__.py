@@ -1,25 +1,26 @@
 """Range differences to receiver positions, and those to mirror normals."""
 
 from rfpose.multilat.bounds import dop, normal_bound, position_bound, tilt_rms_from_position
+from rfpose.multilat.filtering import FilteredPoses, FilterSettings, FilterStatus, filter_poses
 from rfpose.multilat.fix import Fixes, FixStatus, locate
 from rfpose.multilat.normal import Normals, Poses, joint_covariance, mirror_normal, solve_poses
 from rfpose.multilat.ranges import RangeDifferences, RangeStatus, check_unambiguous, range_differences
 from rfpose.multilat.status import PoseStatus
-from rfpose.multilat.tracking import Motion, TrackedPoses, TrackStatus, track_poses
 
 __all__ = [
+    "FilterSettings",
+    "FilterStatus",
+    "FilteredPoses",
     "FixStatus",
     "Fixes",
-    "Motion",
     "Normals",
     "PoseStatus",
     "Poses",
     "RangeDifferences",
     "RangeStatus",
-    "TrackStatus",
-    "TrackedPoses",
     "check_unambiguous",
     "dop",
+    "filter_poses",
     "joint_covariance",
     "locate",
     "mirror_normal",
@@ -28,5 +29,4 @@ __all__ = [
     "range_differences",
     "solve_poses",
     "tilt_rms_from_position",
-    "track_poses",
 ]

@@ -21,7 +21,7 @@ from rfpose.files import claim
 from rfpose.pipeline.formats.mount_file import StoredMount, read_models
 from rfpose.sun import Site, unix_seconds
 
-__all__ = ["Plan", "plan_commands", "write_commands"]
+__all__ = ["CommandPlan", "plan_commands", "write_commands"]
 
 COLUMNS = (
     "time_utc", "heliostat", "axis_1", "axis_2", "status", "sun_azimuth_deg", "sun_elevation_deg",
@@ -35,7 +35,7 @@ _MOST_NEXT = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class CommandPlan:
     """Commands of one heliostat.
 
     Attributes
@@ -103,7 +103,7 @@ def plan_commands(
     heliostats: Sequence[str] = (),
     site: Site | None = None,
     n_next: int = 0,
-) -> tuple[Plan, ...]:
+) -> tuple[CommandPlan, ...]:
     """Make commands for times, and say how well the mirrors will point.
 
     Parameters
@@ -171,7 +171,7 @@ def _plan(
     target: FloatArray,
     mode: Literal["heliostat", "dish"],
     n_next: int,
-) -> Plan:
+) -> CommandPlan:
     year = datetime.fromtimestamp(unix_s[0], UTC).year
     days = unix_seconds([f"{year}-{month:02d}-21T00:00:00Z" for month in range(1, 13)])
     hours = days[:, None] + 1800.0 * np.arange(48)
@@ -197,7 +197,7 @@ def _plan(
         design = next_postures(stored, could, n_posture=n_next)
         when, count = hours.ravel()[good][design.chosen], could.count[design.chosen]
         trace = np.sqrt(design.trace)
-    return Plan(
+    return CommandPlan(
         heliostat=name,
         calibrated=stored.calibrated,
         noise_assumed=stored.noise_assumed,
@@ -210,7 +210,7 @@ def _plan(
     )
 
 
-def write_commands(path: Path, plans: Sequence[Plan], *, force: bool = False) -> None:
+def write_commands(path: Path, plans: Sequence[CommandPlan], *, force: bool = False) -> None:
     """Write commands as CSV, one row a heliostat and time.
 
     Raises
@@ -228,7 +228,7 @@ def write_commands(path: Path, plans: Sequence[Plan], *, force: bool = False) ->
         job.write(path, text.getvalue().encode())
 
 
-def _rows(plan: Plan) -> list[list[Any]]:
+def _rows(plan: CommandPlan) -> list[list[Any]]:
     """Rows of `COLUMNS`."""
     told, sun = plan.forecast, plan.forecast.sun
     known = plan.calibrated

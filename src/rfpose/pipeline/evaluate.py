@@ -14,7 +14,7 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.foreign import load_json
 from rfpose.geometry import angle_between_rad, unit
-from rfpose.multilat import FixStatus, PoseStatus, TrackStatus, position_bound
+from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, position_bound
 from rfpose.pipeline.bound import normal_bound_rad
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import Result
@@ -512,7 +512,7 @@ def _filtered(result: Result, normal_true: FloatArray) -> FilteredErrors | None:
     # the normal has two angles: its covariance is singular along itself
     inverse = np.linalg.pinv(table.cov_enu[given], rcond=1e-10, hermitian=True)
     squared = np.einsum("na,nab,nb->n", off, inverse, off)
-    predicted = np.isin(table.status, (TrackStatus.COASTED, TrackStatus.GATED))
+    predicted = np.isin(table.status, (FilterStatus.COASTED, FilterStatus.GATED))
     return FilteredErrors(
         normal_error_mrad=Statistics.of(1e3 * angle_between_rad(table.normal_enu[given], normal_true[given])),
         sigma_mrad=1e3 * _rms(table.sigma_rad[given]),

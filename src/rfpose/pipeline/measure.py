@@ -15,7 +15,7 @@ from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
 from rfpose.pipeline._workers import worker_pool
 from rfpose.pipeline.formats.journal import Entry, Journal
-from rfpose.pipeline.stages import Stages
+from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
@@ -63,7 +63,7 @@ def measure_tones(
     estimator: str,
     journal: Journal | None = None,
     on_progress: Callable[[int, int], None] | None = None,
-    stages: Stages | None = None,
+    stages: Stopwatch | None = None,
 ) -> TonePhases:
     """Measure every tone in every frame of every receiver.
 
@@ -90,7 +90,7 @@ def measure_tones(
     RecordingError
         The recording is damaged, or the journal cannot be written.
     """
-    stages = Stages() if stages is None else stages
+    stages = Stopwatch() if stages is None else stages
     n_receiver = len(scenario.receiver_ids)
     n_row = len(frame_start_index) * n_receiver
     tones = TonePhases.empty(

@@ -16,7 +16,7 @@ from rfpose import __version__
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.journal import Journal
-from rfpose.pipeline.stages import Stages
+from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
 from rfpose.recording.members import members
 from rfpose.scenario import Scenario, scenario_of
@@ -101,7 +101,7 @@ def process(
     >>> result.poses.normal_enu.shape
     (2, 2, 3)
     """
-    stages = Stages()
+    stages = Stopwatch()
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
     scenario_file = None if isinstance(scenario, Scenario) else scenario

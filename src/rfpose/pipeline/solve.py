@@ -29,7 +29,7 @@ from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
-from rfpose.pipeline.stages import Stages
+from rfpose.pipeline.stages import Stopwatch
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
 
@@ -122,7 +122,7 @@ def solve(
     *,
     settings: Mapping[str, str],
     truth: Truth | None = None,
-    stages: Stages | None = None,
+    stages: Stopwatch | None = None,
 ) -> Result:
     """Find receiver positions and mirror normals from tone phases.
 

@@ -10,12 +10,12 @@ from typing import Any
 
 from rfpose.pipeline._workers import n_worker
 
-__all__ = ["STAGES", "Stages"]
+__all__ = ["STAGES", "Stopwatch"]
 
 STAGES = ("open", "read", "tones", "calibration", "poses", "write")
 
 
-class Stages:
+class Stopwatch:
     """Seconds by stage; threads that are in one side by side all count.
 
     Attributes

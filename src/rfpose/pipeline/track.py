@@ -110,12 +110,12 @@ def track(
         with claim(inputs=records.values()):  # none of the outputs may be one of them
             pass
         # compiled code, which none of the refusals above should wait for
-        from rfpose.feedback.tracking import Simulation
+        from rfpose.feedback.tracking import TrackingSimulation
         from rfpose.pipeline.formats.track_file import track_of, write_track
         from rfpose.pipeline.track_iq import check_with_iq
 
         with naming(scenario):
-            simulation = Simulation(site, methods=methods, count=heliostats, seed=seed)
+            simulation = TrackingSimulation(site, methods=methods, count=heliostats, seed=seed)
         settings = {
             "version": __version__,
             "seed": str(seed),

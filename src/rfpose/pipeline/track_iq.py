@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.timeline import days
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.process import process
@@ -101,7 +101,7 @@ def compare_with_iq(scenario: Scenario, *, heliostat: str, normal_enu: FloatArra
     rot = geometry.rot_enu_from_mirror(normal)
     off = result.poses.normal_enu[0] - normal
     error = np.stack([np.sum(off * rot[:, :, i], axis=1) for i in (0, 1)], axis=1)
-    model = RadioModel(site, site.pivot_enu_m, usual_normal_enu=normal)
+    model = RadioByPosture(site, site.pivot_enu_m, usual_normal_enu=normal)
     errors = model.errors(normal, np.random.default_rng(seed))
     return IqComparison(
         error_rad=error, spread_rad=errors.spread_rad, solved=np.asarray(result.poses.status[0] == PoseStatus.OK)

@@ -10,14 +10,14 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.calibration import FitSettings, fit_many
 from rfpose.feedback.camera.malan import Board, beam_threshold, find_spot, marker_threshold, weighted_centroid
 from rfpose.feedback.camera.model import camera_measurements, spots_enu_m
-from rfpose.feedback.camera.render import Beam, Disturbance, Target, View, project_px, render
+from rfpose.feedback.camera.render import Beam, CameraView, Disturbance, Target, project_px, render
 from rfpose.feedback.camera.search import neighbour_zones_m, search, spiral_offsets_m
 from rfpose.feedback.camera.spot import SpotStatus, read_picture
 from rfpose.feedback.mount import Mount
 
 pytest.importorskip("skimage", reason="pictures need scikit-image")
 
-TARGET, VIEW = Target(), View()
+TARGET, VIEW = Target(), CameraView()
 
 
 def picture(*centres, seed=0, target=TARGET, view=VIEW, worse=None, **beam):
@@ -39,7 +39,7 @@ def test_centroids_of_clean_pictures_are_good_to_a_fraction_of_a_pixel():
     error = []
     for i in range(12):
         true = rng.uniform(-0.45, 0.45, 2)
-        view = View(right_m=rng.uniform(-8, 8), up_m=-11.0, roll_rad=rng.uniform(-0.03, 0.03))
+        view = CameraView(right_m=rng.uniform(-8, 8), up_m=-11.0, roll_rad=rng.uniform(-0.03, 0.03))
         found = find_spot(picture(tuple(true), seed=i, view=view))
         assert found.status == SpotStatus.OK, found.text
         np.testing.assert_allclose(found.centre_px, project_px(view, true), atol=1.5)
@@ -50,7 +50,7 @@ def test_centroids_of_clean_pictures_are_good_to_a_fraction_of_a_pixel():
 
 def test_markers_beat_no_perspective():
     # half the picture's perspective would cost centimetres: the chain must use it
-    view = View(right_m=25.0, up_m=-15.0)
+    view = CameraView(right_m=25.0, up_m=-15.0)
     found = find_spot(picture((0.5, 0.5), view=view))
     np.testing.assert_allclose(found.centre_m, [0.5, 0.5], atol=8e-3)
 
@@ -79,7 +79,7 @@ BAD = {
     "over the edge": (lambda: picture((0.95, 0.1)), SpotStatus.OFF_TARGET),
     "off the target": (lambda: picture((2.5, 0.0)), SpotStatus.NO_SPOT),
     "no markers": (lambda: picture((0.0, 0.0), target=Target(marker_m=0.0)), SpotStatus.NO_MARKERS),
-    "marker out of view": (lambda: picture((0.0, 0.0), view=View(aim_m=(1.2, 0.0))), SpotStatus.NO_MARKERS),
+    "marker out of view": (lambda: picture((0.0, 0.0), view=CameraView(aim_m=(1.2, 0.0))), SpotStatus.NO_MARKERS),
     "small": (lambda: picture((0.0, 0.0))[:30], SpotStatus.WRONG_SIZE),
     "black": (lambda: np.zeros((300, 375), np.uint8), SpotStatus.NO_MARKERS),
 }
@@ -192,8 +192,8 @@ def test_right_and_up_of_a_target_in_the_site():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: View(front_m=-1.0), "front_m"),
-        (lambda: View(shape_px=(1, 5)), "shape_px"),
+        (lambda: CameraView(front_m=-1.0), "front_m"),
+        (lambda: CameraView(shape_px=(1, 5)), "shape_px"),
         (lambda: Board(mm_per_px=0.0), "mm_per_px"),
         (lambda: Board(corners_px=((0.0, 0.0),)), r"shape \(4, 2\)"),
         (lambda: find_spot(np.zeros(5)), "row, column"),

@@ -9,7 +9,7 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.energy import dish_capture, heliostat_intercept
-from rfpose.feedback.tracking import Simulation, score
+from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.feedback.tracking.budget import SampledLoop, mean_intercept, track_budget
 from rfpose.feedback.tracking.capture import capture_table
 from rfpose.feedback.tracking.timeline import day_of
@@ -43,7 +43,7 @@ def changed(hours, *changes):
 
 
 def simulated(scenario, methods, count):
-    simulation = Simulation(scenario, methods=methods, count=count, seed=3)
+    simulation = TrackingSimulation(scenario, methods=methods, count=count, seed=3)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     return {name: score(simulation.sums(name)) for name in methods}

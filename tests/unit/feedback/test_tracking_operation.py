@@ -10,7 +10,7 @@ from rfpose.cli.track import _event
 from rfpose.errors import ScenarioError
 from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.modes import Mode
-from rfpose.feedback.tracking import Simulation, _kernels
+from rfpose.feedback.tracking import TrackingSimulation, _kernels
 from rfpose.feedback.tracking.operation import Operation, _agenda, _Wind, settings_of, who_of
 from rfpose.feedback.tracking.timeline import days, ways_s
 from rfpose.feedback.tracking.watch import AlarmWatch
@@ -37,7 +37,7 @@ def changed(*, events=(), **tracking):
 
 @pytest.fixture(scope="module")
 def field():
-    return Simulation(changed(first_hour=11.5, last_hour=11.6), methods=("open-loop",), count=5).field
+    return TrackingSimulation(changed(first_hour=11.5, last_hour=11.6), methods=("open-loop",), count=5).field
 
 
 def test_events_concern_whom_they_name(field):
@@ -56,7 +56,7 @@ def test_events_concern_whom_they_name(field):
 def test_names_that_nobody_has_are_refused_before_the_first_second():
     for text, words in (("11.55 stow H99", "'H99', which is not tracked"), ("2:11.55 stow #7", "cluster 7")):
         with pytest.raises(ScenarioError, match=words):
-            Simulation(changed(events=(text,), days=2, first_hour=11.5, last_hour=11.6), methods=("open-loop",))
+            TrackingSimulation(changed(events=(text,), days=2, first_hour=11.5, last_hour=11.6), methods=("open-loop",))
 
 
 def test_the_agenda_has_each_event_at_the_first_step_of_its_hour(field):
@@ -103,7 +103,7 @@ def test_contradictions_of_the_same_time(one, other, clash):
 @pytest.mark.parametrize("stow", [(0.0, 0.0), (180.0, 10.0), (-90.0, 90.0)])
 def test_mirrors_are_parked_where_they_are_to_be_within_the_time_for_ways(stow):
     site = changed(field_control={"stow_deg": stow}, min_sun_elevation_deg=54.0)
-    simulation = Simulation(site, methods=("open-loop",), count=8)
+    simulation = TrackingSimulation(site, methods=("open-loop",), count=8)
     field, day = simulation.field, simulation.days[0]
     assert day.from_stow
     operation = Operation(simulation.plant, 0, feedback=_kernels.NO_FEEDBACK)

@@ -17,7 +17,7 @@ from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import draw_field, field_positions
 from rfpose.feedback.tracking.loops import _swing, check_gains, loop_margins
 from rfpose.feedback.tracking.methods import choose
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.sampled_loop import SampledLoop
 from rfpose.feedback.tracking.score import quantile
 from rfpose.feedback.tracking.timeline import days, site_of
@@ -118,7 +118,7 @@ def test_sun_below_the_horizon_is_refused():
 
 
 def radio_model(scenario, normal):
-    return RadioModel(scenario, scenario.pivot_enu_m, usual_normal_enu=normal)
+    return RadioByPosture(scenario, scenario.pivot_enu_m, usual_normal_enu=normal)
 
 
 def field_of(scenario, count=None, seed=1):
@@ -273,7 +273,7 @@ def test_a_few_mirrors_stand_for_a_large_field_over_reflecting_ground():
     radius = np.linspace(20.0, 90.0, 201)
     pivot = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(201, 2.0)], axis=1)
     normal = geometry.unit(np.array([0.0, 0.0, 50.0]) - pivot + [10.0, 40.0, 60.0])
-    errors = RadioModel(scenario, pivot, usual_normal_enu=normal).errors(normal, np.random.default_rng(0))
+    errors = RadioByPosture(scenario, pivot, usual_normal_enu=normal).errors(normal, np.random.default_rng(0))
     assert errors.solved.all()
     assert np.all(errors.sigma_rad > 0.0)
     assert np.sqrt(np.mean(errors.bias_rad**2)) > 1e-3

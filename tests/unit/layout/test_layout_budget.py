@@ -8,8 +8,8 @@ import pytest
 from rfpose import geometry
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.layout import maps
-from rfpose.layout.budget import SOURCES, error_budget, make_plan, target_slope
-from rfpose.layout.budget.world import World
+from rfpose.layout.budget import SOURCES, error_budget, target_slope, working_point
+from rfpose.layout.budget.world import DrawnSites
 from rfpose.measurement import noise_of
 from rfpose.scenario import Scenario, load_scenario
 from rfpose.simulator import Simulator
@@ -39,7 +39,7 @@ def two_tones(**tables):
 
 
 def plan_of(scenario, **settings):
-    return make_plan(scenario, maps.mirrors_of(scenario, sun_enu=SUN), **settings)
+    return working_point(scenario, maps.mirrors_of(scenario, sun_enu=SUN), **settings)
 
 
 def rms(values):
@@ -89,7 +89,7 @@ def test_lines_and_their_sum_are_what_the_solver_shows(case):
 def test_sum_with_an_estimated_reflection_is_what_the_solver_shows():
     # coefficients are common to all mirrors, so that each mirror's errors reach the others
     plan = plan_of(two_tones(**REFLECTING, budget={"ground": "estimated"}))
-    world = World(plan, 25, np.random.default_rng(1))
+    world = DrawnSites(plan, 25, np.random.default_rng(1))
     for source in SOURCES:
         if source.assumed(plan):
             source.disturb(world)
@@ -102,7 +102,7 @@ def test_sum_with_an_estimated_reflection_is_what_the_solver_shows():
 
 def test_a_wrong_height_moves_the_estimated_coefficient_of_all_mirrors():
     plan = plan_of(two_tones(**REFLECTING, budget={"ground": "estimated"}))
-    world = World(plan, 1, np.random.default_rng(0))
+    world = DrawnSites(plan, 1, np.random.default_rng(0))
     world.ground_height_m[:] = plan.scenario.budget.ground_height_sigma_m
     found = error_budget(plan, n_draw=0)
     line = next(line for line in found.lines if line.name == "ground reflection")

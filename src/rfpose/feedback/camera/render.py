@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Beam", "Disturbance", "Target", "View", "project_px", "render"]
+__all__ = ["Beam", "CameraView", "Disturbance", "Target", "project_px", "render"]
 
 Image = npt.NDArray[np.uint8]
 
@@ -52,7 +52,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class View:
+class CameraView:
     """A camera that looks at a point near the target's centre.
 
     Attributes
@@ -154,7 +154,7 @@ class Disturbance:
     flare: float = 0.0
 
 
-def project_px(view: View, point_m: npt.ArrayLike) -> FloatArray:
+def project_px(view: CameraView, point_m: npt.ArrayLike) -> FloatArray:
     """Return column and row of points of the target's plane.
 
     Parameters
@@ -174,7 +174,7 @@ def project_px(view: View, point_m: npt.ArrayLike) -> FloatArray:
 
 def render(
     target: Target,
-    view: View,
+    view: CameraView,
     beams: Beam | tuple[Beam, ...] = (),
     *,
     disturbance: Disturbance | None = None,
@@ -209,7 +209,7 @@ def render(
     return np.clip(np.rint(light), 0.0, 255.0).astype(np.uint8)
 
 
-def _plane(view: View) -> tuple[FloatArray, FloatArray]:
+def _plane(view: CameraView) -> tuple[FloatArray, FloatArray]:
     """Right and up where each pixel's ray meets the target's plane [m]."""
     rows, columns = view.shape_px
     row, column = np.mgrid[0:rows, 0:columns].astype(np.float64)

@@ -23,14 +23,14 @@ from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S, move_axes
 from rfpose.feedback.mount import Mount, aim_rows, stack_mounts
 
-__all__ = ["Field", "Play", "Receiver", "play", "ring_field", "share_on_receiver"]
+__all__ = ["EmergencyField", "Play", "TowerReceiver", "play", "ring_field", "share_on_receiver"]
 
 _AIM_EVERY_S = 4.0
 _EVERYTHING_STANDS = (Mode.STOW, Mode.FAULT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Receiver:
+class TowerReceiver:
     """An upright cylinder, which each mirror sees as a rectangle that faces it.
 
     Attributes
@@ -53,7 +53,7 @@ class Receiver:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
+class EmergencyField:
     """Mirrors, their drives, and the receiver that they serve.
 
     Attributes
@@ -71,7 +71,7 @@ class Field:
     """
 
     pivot_enu_m: FloatArray
-    receiver: Receiver
+    receiver: TowerReceiver
     rate_rad_s: float = PROTOTYPE_RATE_RAD_S
     mirror_m: float = 3.2
     sun_sigma_rad: float = 9.3e-3 / 4.0
@@ -136,7 +136,7 @@ def ring_field(n: int, *, nearest_m: float = 30.0, spacing_m: float = 6.0) -> Fl
 
 
 def share_on_receiver(
-    field: Field, normal_enu: FloatArray, centre_enu_m: FloatArray, sun_enu: FloatArray
+    field: EmergencyField, normal_enu: FloatArray, centre_enu_m: FloatArray, sun_enu: FloatArray
 ) -> FloatArray:
     """Return what part of the light that its area could collect each mirror brings to the receiver (heliostat,).
 
@@ -190,7 +190,7 @@ class _Mirrors:
 
 def play(
     control: FieldControl,
-    field: Field,
+    field: EmergencyField,
     *,
     time_s: npt.ArrayLike,
     sun_enu: npt.ArrayLike,

@@ -160,7 +160,7 @@ class Models(NamedTuple):
     """and how their variances grow from fit to fit."""
 
 
-class Surroundings(NamedTuple):
+class Weather(NamedTuple):
     """Sun, warmth and wind of a stretch of steps."""
 
     sun: FloatArray
@@ -248,7 +248,7 @@ class Stretch(NamedTuple):
     steering: Steering
     mounts: Mounts
     models: Models
-    surroundings: Surroundings
+    surroundings: Weather
     readings: Readings
     memory: Memory
     tally: Tally

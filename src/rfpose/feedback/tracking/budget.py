@@ -45,8 +45,8 @@ from rfpose.feedback.tracking.instruments import RadioPoses
 from rfpose.feedback.tracking.loops import loop_of
 from rfpose.feedback.tracking.methods import Method, choose
 from rfpose.feedback.tracking.plant import Plant
-from rfpose.feedback.tracking.postures import Postures
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.postures import PosturesInTime
+from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.sampled_loop import SampledLoop
 from rfpose.feedback.tracking.timeline import Day, site_of
 from rfpose.scenario import Scenario
@@ -207,7 +207,7 @@ def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -
     Raises
     ------
     ScenarioError, GeometryError, InvalidInputError
-        As `rfpose.feedback.tracking.Simulation` does, but for gains, which may have any margin above none.
+        As `rfpose.feedback.tracking.TrackingSimulation` does, but for gains, which may have any margin above none.
     """
     chosen = choose((method,), collector=scenario.tracking.collector)[0]
     return _Propagation(scenario, chosen, count).budget()
@@ -225,7 +225,7 @@ class _Tracked:
     """(time,) steps that stand for all, """
     span_s: float
     """which last so long."""
-    postures: Postures
+    postures: PosturesInTime
     speed: FloatArray = field(repr=False)
     """(mirror, time, axis) [rad/s]"""
 
@@ -242,7 +242,7 @@ class _Looked:
 
     calibration: Calibration
     since_first: int
-    looks: Postures
+    looks: PosturesInTime
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,10 +266,10 @@ class _Propagation:
         self._field, self._gusts = plant.field, plant.gusts
         self._loop = loop_of(scenario, method.feedback)
         self._radio: RadioPoses | None = None
-        model: RadioModel | None = None
+        model: RadioByPosture | None = None
         if method.radio:
             self._check_stable()
-            model = RadioModel(scenario, plant.field.pivot_enu_m, usual_normal_enu=plant.usual_normal_enu())
+            model = RadioByPosture(scenario, plant.field.pivot_enu_m, usual_normal_enu=plant.usual_normal_enu())
             self._radio = RadioPoses(plant, model)
         self._calibration = calibration_of(method.knowledge, plant, model)
         self._sees_mirror = method.feedback in (_kernels.RADIO, _kernels.SUN_SENSOR)
@@ -348,7 +348,7 @@ class _Propagation:
         return _Tracked(day=day, at=at, span_s=len(scored) * servo_s, postures=postures, speed=speed)
 
     def _jacobian(
-        self, postures: Postures, names: tuple[str, ...], *, direct: bool = False, of_receiver_plane: bool = False
+        self, postures: PosturesInTime, names: tuple[str, ...], *, direct: bool = False, of_receiver_plane: bool = False
     ) -> FloatArray:
         """(mirror, time, xyz, name) of the normal less the wanted one; ``direct``: of the normal itself."""
         rows = postures.rows
@@ -494,7 +494,7 @@ class _Propagation:
             "start": np.asarray(morning * self._loop.start_rms(self._plan.settle_s, tracked.span_s) ** 2),
         }
 
-    def _of_place(self, postures: Postures) -> FloatArray:
+    def _of_place(self, postures: PosturesInTime) -> FloatArray:
         names = tuple(self._sigma)
         seen = self._jacobian(postures, names) - self._jacobian(postures, names, direct=True)
         return np.asarray(np.sum((seen * np.array(list(self._sigma.values()))) ** 2, axis=(-2, -1)))

@@ -20,8 +20,8 @@ from rfpose.feedback.tracking.hidden import TILTS, WORMS, ZEROS, generator
 from rfpose.feedback.tracking.instruments import CameraSpots, DroneFlights, Instrument, RadioPoses, measure, plate_looks
 from rfpose.feedback.tracking.methods import Knowledge, Method
 from rfpose.feedback.tracking.plant import Plant
-from rfpose.feedback.tracking.postures import Postures, aimed
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.postures import PosturesInTime, aimed
+from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.timeline import Day, heat_of, hour_of_day, look_times, site_of
 from rfpose.sun import sun_position
 
@@ -93,7 +93,7 @@ class Calibration:
         return int(np.floor(cycles * self.interval_days - half))
 
 
-def calibration_of(knowledge: Knowledge, plant: Plant, radio: RadioModel | None) -> Calibration | None:
+def calibration_of(knowledge: Knowledge, plant: Plant, radio: RadioByPosture | None) -> Calibration | None:
     """Return how a method comes to its knowledge; None: it keeps to the mounts as planned."""
     plan = plant.scenario.tracking
     camera, drone, by_radio = plan.camera, plan.drone, plan.radio_model
@@ -150,7 +150,7 @@ class Calibrator:
         Errors of radio poses; None without radio.
     """
 
-    def __init__(self, plant: Plant, radio: RadioModel | None) -> None:
+    def __init__(self, plant: Plant, radio: RadioByPosture | None) -> None:
         self._plant, self._radio = plant, radio
         self._plate: FloatArray | None = None
 
@@ -169,7 +169,7 @@ class Calibrator:
 
     def _look(
         self, model: FloatArray, unix_s: FloatArray, since_first: int, rng: np.random.Generator, target: FloatArray
-    ) -> Postures:
+    ) -> PosturesInTime:
         """Steer all mirrors by a model at some instants and see where they really point."""
         field, plan, gusts = self._plant.field, self._plant.scenario.tracking, self._plant.gusts
         site = site_of(self._plant.scenario)
@@ -189,7 +189,7 @@ class Calibrator:
             out = _kernels.posture_batch(p, field.constant, (count + slack * per_rad)[:, j : j + 1].copy(), 0.0)
             normal[:, j], centre[:, j] = out[:, 0, 2:5], out[:, 0, 5:]
         seen = np.asarray(np.isfinite(count).all(axis=-1))
-        look = Postures(
+        look = PosturesInTime(
             sun_enu=sun, heat=heat, count=count, seen=seen, rows=rows, normal_enu=normal, centre_enu_m=centre,
         )  # fmt: skip
         bent = look.tilted(gusts.bend_rad(gusts.draw(rng, (n, m))) + gusts.swing_rad(rng, (n, m)))

@@ -21,7 +21,7 @@ from rfpose.feedback.fieldcontrol.modes import Event, Mode
 from rfpose.feedback.optics import reflect, target_offset_m
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import correct_zeros
-from rfpose.feedback.tracking.hidden import TILTS, Field, generator
+from rfpose.feedback.tracking.hidden import TILTS, HiddenField, generator
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.scenario import Scenario
 
@@ -51,7 +51,7 @@ class Campaign:
         ``offset_mm`` that the camera saw, ``at_s`` after the day's first step, ``took_s``.
     """
 
-    def __init__(self, scenario: Scenario, field: Field, *, feedback: int, seed: int) -> None:
+    def __init__(self, scenario: Scenario, field: HiddenField, *, feedback: int, seed: int) -> None:
         self._plan, self._field, self._seed, self._feedback = scenario.tracking, field, seed, feedback
         self._waiting: list[int] = []
         self._there: dict[str, Any] | None = None

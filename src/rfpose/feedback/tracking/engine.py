@@ -22,7 +22,7 @@ from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.jit import load_numba
 
-__all__ = ["Arrays", "Draws", "Engine", "always_track", "empty_courses", "empty_tally"]
+__all__ = ["Arrays", "Engine", "StretchDraws", "always_track", "empty_courses", "empty_tally"]
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -32,8 +32,8 @@ _PART = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Draws:
-    """What a stretch of time brings to all methods alike; see `_kernels.Surroundings` and `_kernels.Readings`."""
+class StretchDraws:
+    """What a stretch of time brings to all methods alike; see `_kernels.Weather` and `_kernels.Readings`."""
 
     mean_mps: float
     gust: npt.NDArray[np.float32]
@@ -102,7 +102,7 @@ class Engine:
     # -- going on ------------------------------------------------------------------------------------------
 
     def stretch(
-        self, day: Day, steps: slice, draws: Draws, tally: _kernels.Tally, courses: _kernels.Courses
+        self, day: Day, steps: slice, draws: StretchDraws, tally: _kernels.Tally, courses: _kernels.Courses
     ) -> _kernels.Stretch:
         """Return all that mirrors go through steps of a day with; true mounts are a copy, to be changed."""
         plant, field = self._plant, self._plant.field
@@ -114,7 +114,7 @@ class Engine:
             steering=self._steering,
             mounts=_kernels.Mounts(field.at(day.since_first), field.constant, field.lean_rad, field.target),
             models=_kernels.Models(self.model, self.cov, self._free, scales_of(learned), np.full(len(learned), walk)),
-            surroundings=_kernels.Surroundings(
+            surroundings=_kernels.Weather(
                 sun=day.sun_enu[steps.start : steps.stop + self.loop.interval + 1].copy(),
                 # negative: the field is not to work
                 power=np.where(day.works, day.power_w_per_m2, -1.0)[steps].copy(),

@@ -21,7 +21,7 @@ __all__ = [
     "TILTS",
     "WORMS",
     "ZEROS",
-    "Field",
+    "HiddenField",
     "azimuth_course_rad",
     "draw_field",
     "field_positions",
@@ -38,7 +38,7 @@ _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Field:
+class HiddenField:
     """Mirrors with their true and their nominal mounts; rows are mirrors.
 
     Attributes
@@ -82,10 +82,10 @@ class Field:
         """Whether the mirrors look at the sun."""
         return bool(self.target[0, 3])
 
-    def some(self, rows: npt.NDArray[np.int64]) -> Field:
+    def some(self, rows: npt.NDArray[np.int64]) -> HiddenField:
         """Return some of the mirrors."""
         values = {f.name: getattr(self, f.name)[rows] for f in dataclasses.fields(self) if f.name != "ids"}
-        return Field(ids=tuple(self.ids[i] for i in rows), **values)
+        return HiddenField(ids=tuple(self.ids[i] for i in rows), **values)
 
     def at(self, day: float) -> FloatArray:
         """Return the true mounts so many days after the first (mirror, parameter)."""
@@ -126,7 +126,7 @@ def field_positions(scenario: Scenario, count: int | None) -> tuple[tuple[str, .
     return tuple(f"H{k + 1:05d}" for k in range(count)), places
 
 
-def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: FloatArray) -> Field:
+def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: FloatArray) -> HiddenField:
     """Draw the mirrors of a run; azimuth axes have the middle of their travel on the course ``sun_enu`` (time, xyz).
 
     Raises
@@ -152,7 +152,7 @@ def draw_field(scenario: Scenario, *, count: int | None, seed: int, sun_enu: Flo
     target[:, 3] = float(is_dish)
     if not is_dish:
         target[:, :3] = scenario.site.aim_enu_m
-    return Field(
+    return HiddenField(
         ids=ids,
         pivot_enu_m=pivot,
         nominal=nominal,

@@ -15,8 +15,8 @@ from rfpose.feedback.drone import drone_sigma_rad
 from rfpose.feedback.mount import aim_rows
 from rfpose.feedback.optics import reflect
 from rfpose.feedback.tracking.plant import Plant
-from rfpose.feedback.tracking.postures import Postures
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.postures import PosturesInTime
+from rfpose.feedback.tracking.radio import RadioByPosture
 
 __all__ = ["CameraSpots", "DroneFlights", "Instrument", "RadioPoses", "RadioVariance", "measure", "plate_looks"]
 
@@ -39,10 +39,10 @@ class Instrument(Protocol):
     sees_receiver_plane: bool
     """Its normals are those of the receivers' plane, not the mirror's."""
 
-    def draw(self, looks: Postures, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def draw(self, looks: PosturesInTime, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Return errors of looks (mirror, look, 2), constant ones included, and the sigma told of them [rad]."""
 
-    def variance_rad2(self, looks: Postures) -> FloatArray:
+    def variance_rad2(self, looks: PosturesInTime) -> FloatArray:
         """Return the variance of single looks' scatter (mirror, look, 2) [rad²]."""
 
     def constant_variance_rad2(self) -> FloatArray:
@@ -57,7 +57,7 @@ def plate_looks(plant: Plant) -> tuple[int, int] | None:
     return -max(int(plan.camera.interval_days // 2), 1), plan.camera.points_per_day
 
 
-def measure(instrument: Instrument, looks: Postures, rng: np.random.Generator) -> FloatArray:
+def measure(instrument: Instrument, looks: PosturesInTime, rng: np.random.Generator) -> FloatArray:
     """Return what an instrument measures as rows of a fit (mirror, look, row); not finite: nothing."""
     error, sigma = instrument.draw(looks, rng)
     normal = looks.tilted(error)
@@ -85,20 +85,20 @@ class CameraSpots:
             self.target_enu_m[:] = self._settings.target_enu_m
         self._constant_sigma_rad = 1e-3 * self._settings.scale_error_sigma_mrad
 
-    def sigma_rad(self, looks: Postures) -> FloatArray:
+    def sigma_rad(self, looks: PosturesInTime) -> FloatArray:
         """Return the scatter of a look in each direction (mirror, look) [rad]."""
         distance = np.linalg.norm(self.target_enu_m[:, None] - looks.centre_enu_m, axis=-1)
         if self._field.is_dish:
             distance = np.full(distance.shape, _DISH_SCREEN_M)
         return np.asarray(np.maximum(0.5e-3 * self._settings.spot_sigma_mm / distance, _SHARPEST_RAD))
 
-    def draw(self, looks: Postures, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def draw(self, looks: PosturesInTime, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """See `Instrument`."""
         sigma = self.sigma_rad(looks)
         noise = sigma[..., None] * rng.standard_normal((*sigma.shape, 2))
         return noise + self._field.camera_bias_rad[:, None], sigma
 
-    def variance_rad2(self, looks: Postures) -> FloatArray:
+    def variance_rad2(self, looks: PosturesInTime) -> FloatArray:
         """See `Instrument`."""
         return np.repeat(self.sigma_rad(looks)[..., None] ** 2, 2, axis=-1)
 
@@ -117,7 +117,7 @@ class DroneFlights:
         self.target_enu_m = plant.field.target[:, :3]
         self._constant_sigma_rad = 1e-3 * self._settings.constant_sigma_mrad
 
-    def sigma_rad(self, looks: Postures) -> FloatArray:
+    def sigma_rad(self, looks: PosturesInTime) -> FloatArray:
         """Return the scatter of a look in each direction (mirror, look) [rad]."""
         return drone_sigma_rad(
             looks.centre_enu_m + self._settings.distance_m * looks.sun_enu,
@@ -125,13 +125,13 @@ class DroneFlights:
             target_enu_m=np.broadcast_to(self.target_enu_m[:, None], looks.centre_enu_m.shape),
         )
 
-    def draw(self, looks: Postures, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def draw(self, looks: PosturesInTime, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """See `Instrument`."""
         sigma = self.sigma_rad(looks)
         noise = rng.standard_normal((*looks.count.shape[:2], 2))
         return sigma[..., None] * noise + self._field.drone_bias_rad[:, None], sigma
 
-    def variance_rad2(self, looks: Postures) -> FloatArray:
+    def variance_rad2(self, looks: PosturesInTime) -> FloatArray:
         """See `Instrument`."""
         return np.repeat(self.sigma_rad(looks)[..., None] ** 2, 2, axis=-1)
 
@@ -154,11 +154,11 @@ class RadioPoses:
 
     sees_spots, sees_receiver_plane = False, True
 
-    def __init__(self, plant: Plant, radio: RadioModel) -> None:
+    def __init__(self, plant: Plant, radio: RadioByPosture) -> None:
         self._plant, self._field, self._radio = plant, plant.field, radio
         self.target_enu_m = plant.field.target[:, :3]
 
-    def draw(self, looks: Postures, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def draw(self, looks: PosturesInTime, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """See `Instrument`; NaN: no pose."""
         plate = self._field.true[:, _PLATE]
         out = np.empty((*looks.count.shape[:2], 2))
@@ -173,7 +173,7 @@ class RadioPoses:
             out[~errors.solved, j] = np.nan
         return out, np.maximum(errors.sigma_rad / np.sqrt(2.0), _SHARPEST_RAD)[:, None]
 
-    def expected(self, looks: Postures) -> RadioVariance:
+    def expected(self, looks: PosturesInTime) -> RadioVariance:
         """Return the mean over postures, as far as they have poses."""
         rng = np.random.default_rng(0)
         noise, bias = [], []
@@ -186,7 +186,7 @@ class RadioPoses:
         mean = np.sum(np.nan_to_num(noise), axis=0) / np.maximum(known.sum(axis=0), 1)
         return RadioVariance(noise=mean, bias=np.mean(bias, axis=0))
 
-    def variance_rad2(self, looks: Postures) -> FloatArray:
+    def variance_rad2(self, looks: PosturesInTime) -> FloatArray:
         """See `Instrument`."""
         return np.broadcast_to(self.expected(looks).noise[:, None], (*looks.count.shape[:2], 2))
 

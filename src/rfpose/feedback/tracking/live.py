@@ -15,12 +15,12 @@ from rfpose.feedback.fieldcontrol.control import FieldControl
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import Calibrator
-from rfpose.feedback.tracking.engine import Draws, Engine, always_track, empty_courses, empty_tally
+from rfpose.feedback.tracking.engine import Engine, StretchDraws, always_track, empty_courses, empty_tally
 from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS
 from rfpose.feedback.tracking.plant import Plant
-from rfpose.feedback.tracking.radio import RadioErrors, RadioModel
+from rfpose.feedback.tracking.radio import RadioByPosture, RadioErrors
 from rfpose.scenario import Scenario
 
 __all__ = ["MOST_MIRRORS", "LiveField", "Moment", "live_scenario"]
@@ -77,7 +77,7 @@ class Moment:
         return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
-class _Radio(RadioModel):
+class _Radio(RadioByPosture):
     """The radio model with transmitters off the air."""
 
     def __init__(self, scenario: Scenario, pivot_enu_m: FloatArray, *, usual_normal_enu: FloatArray) -> None:
@@ -304,7 +304,7 @@ class LiveField:
             engine.go(stretch, tasks, first, first + each)
         return courses.trace[:, -1, :3], courses.error[:, -1], modes
 
-    def _draw(self, steps: slice, extra_mps: FloatArray) -> Draws:
+    def _draw(self, steps: slice, extra_mps: FloatArray) -> StretchDraws:
         """Draw wind and radio frames of a step."""
         n, plant, n_step = len(self.field), self._plant, self._interval
         mean = max(plant.gusts.mean_mps, _LEAST_WIND_MPS)
@@ -315,7 +315,7 @@ class LiveField:
         noise = rng.standard_normal((n, 1, 2), dtype=np.float32)
         lost = (rng.random((n, 1), dtype=np.float32) < self._scenario.tracking.radio.lost_frames).astype(np.uint8)
         lost[~self._radio_errors.solved] = 1
-        return Draws(
+        return StretchDraws(
             mean_mps=mean,
             # the kernel's push is V² + 2 V g: what makes it the square of the speed with the gust
             gust=(wind + ((mean + wind) * extra_mps + 0.5 * extra_mps**2) / mean).astype(np.float32),

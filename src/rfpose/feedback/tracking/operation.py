@@ -23,7 +23,7 @@ from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings, Or
 from rfpose.feedback.fieldcontrol.modes import Event, Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.campaign import Campaign
-from rfpose.feedback.tracking.hidden import Field, generator
+from rfpose.feedback.tracking.hidden import HiddenField, generator
 from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.postures import aim_count
 from rfpose.feedback.tracking.timeline import Day
@@ -388,7 +388,7 @@ def settings_of(scenario: Scenario, *, arrived_rad: float) -> FieldSettings:
     )
 
 
-def who_of(event: Happening, field: Field, cluster_size: int) -> npt.NDArray[np.bool_]:
+def who_of(event: Happening, field: HiddenField, cluster_size: int) -> npt.NDArray[np.bool_]:
     """Return which mirrors an event concerns (mirror,).
 
     Raises
@@ -420,7 +420,7 @@ def who_of(event: Happening, field: Field, cluster_size: int) -> npt.NDArray[np.
 
 
 def _agenda(
-    events: tuple[Happening, ...], day: Day, number: int, field: Field, cluster_size: int
+    events: tuple[Happening, ...], day: Day, number: int, field: HiddenField, cluster_size: int
 ) -> list[tuple[int, Happening, npt.NDArray[np.bool_]]]:
     """Return a day's events in order: step, event, whom it concerns."""
     found = []

@@ -14,7 +14,7 @@ from rfpose.feedback.columns import constant
 from rfpose.feedback.mount import CommandStatus
 from rfpose.feedback.tracking.capture import capture_table
 from rfpose.feedback.tracking.hidden import azimuth_course_rad, draw_field
-from rfpose.feedback.tracking.postures import Postures, aim_count, aimed
+from rfpose.feedback.tracking.postures import PosturesInTime, aim_count, aimed
 from rfpose.feedback.tracking.sky import under_sky
 from rfpose.feedback.tracking.timeline import Day, days, heat_of, hour_of_day, look_times, site_of
 from rfpose.feedback.tracking.wind import Gusts
@@ -75,7 +75,7 @@ class Plant:
         day = self.days[0]
         return self.wanted_normal_enu(day, int(np.argmax(day.sun_enu[:, 2])))
 
-    def nominal_postures(self, sun_enu: FloatArray, heat: FloatArray, target_enu_m: FloatArray) -> Postures:
+    def nominal_postures(self, sun_enu: FloatArray, heat: FloatArray, target_enu_m: FloatArray) -> PosturesInTime:
         """Return how nominal mirrors stand that send the sun (time, xyz) to targets (mirror, xyz).
 
         Where there is no such posture they stand at count zero.
@@ -86,12 +86,12 @@ class Plant:
         seen = np.asarray(np.isfinite(count).all(axis=-1))
         count = np.where(seen[..., None], count, 0.0)
         out = _kernels.posture_batch(field.nominal, field.constant, count, 0.0)
-        return Postures(
+        return PosturesInTime(
             sun_enu=sun_enu, heat=heat, count=count, seen=seen, rows=rows, normal_enu=out[..., 2:5],
             centre_enu_m=out[..., 5:],
         )  # fmt: skip
 
-    def nominal_looks(self, since_first: int, n_look: int, target_enu_m: FloatArray) -> Postures:
+    def nominal_looks(self, since_first: int, n_look: int, target_enu_m: FloatArray) -> PosturesInTime:
         """Return the same at looks that are spread over a day; see `look_times`."""
         unix_s, site = look_times(self.scenario, since_first, n_look), site_of(self.scenario)
         sun = sun_position(unix_s, site).direction_enu

@@ -12,11 +12,11 @@ from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.mount import CommandStatus, aim_rows
 
-__all__ = ["Postures", "aim_count", "aimed"]
+__all__ = ["PosturesInTime", "aim_count", "aimed"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Postures:
+class PosturesInTime:
     """Mirrors at some times.
 
     Attributes
@@ -59,10 +59,10 @@ class Postures:
         right, up = self.right_up
         return geometry.unit(self.normal_enu + right_up_rad[..., :1] * right + right_up_rad[..., 1:] * up)
 
-    def only(self, i_time: int) -> Postures:
+    def only(self, i_time: int) -> PosturesInTime:
         """Return one of the times."""
         at = slice(i_time, i_time + 1)
-        return Postures(
+        return PosturesInTime(
             sun_enu=self.sun_enu[at],
             heat=self.heat[at],
             count=self.count[:, at].copy(),
@@ -72,10 +72,10 @@ class Postures:
             centre_enu_m=self.centre_enu_m[:, at],
         )
 
-    def of_turns(self, i_time: npt.NDArray[np.int64]) -> Postures:
+    def of_turns(self, i_time: npt.NDArray[np.int64]) -> PosturesInTime:
         """Return one time of each mirror; the sun is then no longer the same for all, and left out."""
         row = np.arange(len(i_time))
-        return Postures(
+        return PosturesInTime(
             sun_enu=np.empty((0, 3)),
             heat=np.empty(0),
             count=self.count[row, i_time][:, None],

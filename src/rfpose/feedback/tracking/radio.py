@@ -23,7 +23,7 @@ from rfpose.multilat.ground.model import range_shift_m
 from rfpose.multilat.rigid import MirrorProblem, Observation, rigid_bound
 from rfpose.scenario import Scenario
 
-__all__ = ["RadioErrors", "RadioModel"]
+__all__ = ["RadioByPosture", "RadioErrors"]
 
 _SAMPLE = 200
 """Mirrors from which the effect of a reflection is taken over to all."""
@@ -55,7 +55,7 @@ class RadioErrors:
         return np.asarray(np.sqrt(np.sum(self.spread_rad**2, axis=1)))
 
 
-class RadioModel:
+class RadioByPosture:
     """Errors of radio poses, posture by posture.
 
     Parameters

@@ -14,7 +14,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import Calibrator
-from rfpose.feedback.tracking.engine import Arrays, Draws, Engine, always_track, empty_courses, empty_tally
+from rfpose.feedback.tracking.engine import Arrays, Engine, StretchDraws, always_track, empty_courses, empty_tally
 from rfpose.feedback.tracking.hidden import ZEROS
 from rfpose.feedback.tracking.methods import Method
 from rfpose.feedback.tracking.operation import Operation
@@ -165,7 +165,7 @@ class MethodRun:
 
     # -- going on ------------------------------------------------------------------------------------------
 
-    def go_through(self, segment: Segment, draws: Draws) -> None:
+    def go_through(self, segment: Segment, draws: StretchDraws) -> None:
         """Take the method through a stretch: at once, or from word to word of its field control."""
         plant, engine, operation, stored = self._plant, self.engine, self._operation, self._kept.stored
         day, stride, n_step = plant.days[segment.i_day], self._kept.stride, segment.end - segment.first

@@ -13,23 +13,23 @@ from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo.margins import Margins
 from rfpose.feedback.tracking.calibrations import Calibrator
-from rfpose.feedback.tracking.engine import Arrays, Draws
+from rfpose.feedback.tracking.engine import Arrays, StretchDraws
 from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import choose
 from rfpose.feedback.tracking.operation import who_of
 from rfpose.feedback.tracking.plant import Plant
-from rfpose.feedback.tracking.radio import RadioModel
+from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.run import Curves, Kept, MethodRun, Segment, Sums
 from rfpose.scenario import Scenario
 
-__all__ = ["Curves", "Simulation", "Sums"]
+__all__ = ["Curves", "Sums", "TrackingSimulation"]
 
 SEGMENT_S = 900.0
 """Simulated time between two points at which a run can be taken up again."""
 
 
-class Simulation:
+class TrackingSimulation:
     """A field tracked by several methods; go through it with `advance`.
 
     Parameters
@@ -62,10 +62,10 @@ class Simulation:
         self.field, self.days = self.plant.field, self.plant.days
         needs_radio = any(m.radio for m in self.methods)
         self.margins: Margins | None = check_gains(scenario) if needs_radio else None
-        self.radio: RadioModel | None = None
+        self.radio: RadioByPosture | None = None
         if needs_radio:
             usual = self.plant.usual_normal_enu()
-            self.radio = RadioModel(scenario, self.field.pivot_enu_m, usual_normal_enu=usual)
+            self.radio = RadioByPosture(scenario, self.field.pivot_enu_m, usual_normal_enu=usual)
         n = len(self.field)
         self.stored = np.unique(np.linspace(0, n - 1, min(plan.stored, n)).astype(np.int64))
         self._stride = round(plan.store_interval_s / plan.servo_interval_s)
@@ -135,7 +135,7 @@ class Simulation:
             run.go_through(segment, draws)
         self.done += 1
 
-    def _draw(self, segment: Segment) -> Draws:
+    def _draw(self, segment: Segment) -> StretchDraws:
         """Draw what a stretch brings to all methods."""
         plant, plan, day, n = self.plant, self.scenario.tracking, self.days[segment.i_day], len(self.field)
         steps = slice(segment.first, segment.end)
@@ -153,7 +153,7 @@ class Simulation:
             errors = self.radio.errors(plant.wanted_normal_enu(day, (segment.first + segment.end) // 2), rng)
             spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
             lost[~errors.solved] = 1
-        return Draws(
+        return StretchDraws(
             mean_mps=plant.gusts.mean_mps,
             gust=gust.result(),
             swing=plant.gusts.draw_swing(rng, (n, n_step)),

@@ -28,14 +28,14 @@ from rfpose.multilat.rigid import MirrorProblem
 from rfpose.multilat.rigid.integers import solve_ladder
 from rfpose.scenario import Scenario
 
-__all__ = ["Plan", "converter_share_of", "make_plan"]
+__all__ = ["WorkingPoint", "converter_share_of", "working_point"]
 
 _STEP_M = 1e-3
 _COEFFICIENT_STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class WorkingPoint:
     """The working point: expected poses, wavelengths used, and what the solver assumes; arrays are read-only.
 
     Attributes
@@ -221,7 +221,7 @@ class Plan:
         return np.zeros((*self.thermal_m.shape, 0))
 
 
-def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> Plan:
+def working_point(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> WorkingPoint:
     """Return the working point of a scenario's budget.
 
     Finer tones and the carrier take part where the solver would trust their whole wavelengths on every mirror.
@@ -255,7 +255,7 @@ def make_plan(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> P
     noise = noise_of(scenario)
     own, _ = noise.groups(carrier=estimator.carrier)
     receiver = mirrors.receiver_enu_m
-    plan = Plan(
+    plan = WorkingPoint(
         scenario=scenario,
         mirrors=mirrors,
         estimator=estimator,
@@ -321,7 +321,7 @@ def converter_share_of(scenario: Scenario, receiver_enu_m: FloatArray) -> float:
     return float(step**2 / 12.0 / noise**2)
 
 
-def _with_trusted_groups(plan: Plan) -> Plan:
+def _with_trusted_groups(plan: WorkingPoint) -> WorkingPoint:
     """Keep the wavelengths whose integers the solver resolves on every mirror."""
     mirrors, transmitter = plan.mirrors, plan.scenario.transmitter_enu_m
     distance = _ranges(transmitter, mirrors.receiver_enu_m)[None, :, None]
@@ -336,7 +336,7 @@ def _with_trusted_groups(plan: Plan) -> Plan:
     )
 
 
-def _with_slopes(plan: Plan) -> Plan:
+def _with_slopes(plan: WorkingPoint) -> WorkingPoint:
     """Add the slopes of ranges by receivers' and transmitters' places, reflections included where they are solved."""
     transmitter, there = plan.scenario.transmitter_enu_m, plan.scenario.calibration_enu_m
     receiver = plan.mirrors.receiver_enu_m

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.layout.budget.plan import Plan
-from rfpose.layout.budget.world import World
+from rfpose.layout.budget.plan import WorkingPoint
+from rfpose.layout.budget.world import DrawnSites
 from rfpose.scenario import Scenario
 
 __all__ = ["SOURCES", "Effect", "Source"]
@@ -56,21 +56,21 @@ class Source(Protocol):
     name: str
     remedy: str
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         """Return what is assumed, in words; empty where the site does not have this source."""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         """Return what it does by slopes (mirror, output, group, receiver, transmitter) and (mirror, output, xyz)."""
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         """Draw this source's errors into the world."""
 
 
-def _calibrated(plan: Plan) -> bool:
+def _calibrated(plan: WorkingPoint) -> bool:
     return bool(plan.scenario.calibration_receiver)
 
 
-def _of_calibration(plan: Plan, by_range: FloatArray, root_m: FloatArray) -> Effect:
+def _of_calibration(plan: WorkingPoint, by_range: FloatArray, root_m: FloatArray) -> Effect:
     """Errors of calibration phases: ``root_m`` (calibration receiver, tone, transmitter, draw) in ranges there [m]."""
     through = by_range[:, :, : plan.waves.n_tone].sum(axis=3)
     slope = -np.einsum("magt,cgt,cgtx->max", through, plan.calibration_weight, root_m)
@@ -96,10 +96,10 @@ class Thermal:
         s = plan.scenario
         return f"{s.simulation.tone_snr_db:g} dB a sample, {s.radio.frame_samples} samples"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         return [Effect(_flat(by_range * plan.thermal_m[:, None]))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         world.range_m += world.plan.thermal_m * world.normal(*world.range_m.shape)
 
 
@@ -114,14 +114,14 @@ class Quantisation:
             return ""
         return f"{plan.scenario.simulation.adc_bits} bits, {plan.scenario.simulation.headroom_db:g} dB headroom"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         share = np.sqrt(plan.converter_share)
         found = [Effect(_flat(by_range * (share * plan.thermal_m[:, None])))]
         if _calibrated(plan):
             found.append(_of_calibration(plan, by_range, _diagonal(share * plan.calibration_thermal_m)))
         return found
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         share = np.sqrt(world.plan.converter_share)
         world.range_m += share * world.plan.thermal_m * world.normal(*world.range_m.shape)
         shape = world.calibration_m.shape
@@ -134,21 +134,21 @@ class Clock:
     name = "clock"
     remedy = "measure the delays, learn them over frames, or leave them unknown (one clock a receiver)"
 
-    def _sigma_m(self, plan: Plan) -> float:
+    def _sigma_m(self, plan: WorkingPoint) -> float:
         s = plan.scenario.budget.receiver_delay_sigma_s
         own = plan.scenario.heliostat[0].receiver_delay_sigma_s
         return float((own or 0.0) if s is None else s) * plan.scenario.radio.propagation_speed_mps
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         delay_ns = 1e9 * self._sigma_m(plan) / plan.scenario.radio.propagation_speed_mps
         if np.isinf(plan.estimator.clock_sigma_m) or not plan.estimator.rigid:
             return "delays between receivers unknown, solved for in every frame"
         return f"{delay_ns:.3g} ns between a mirror's receivers"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         return [Effect(self._sigma_m(plan) * by_range.sum(axis=(2, 4)))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         n_draw, n_mirror, _, n_receiver, _ = world.range_m.shape
         delay = self._sigma_m(world.plan) * world.normal(n_draw, n_mirror, n_receiver)
         world.range_m += delay[:, :, None, :, None]
@@ -160,14 +160,14 @@ class CalibrationNoise:
     name = "calibration noise"
     remedy = "more calibration receivers, or average their phases over frames"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         n = len(plan.scenario.calibration_receiver)
         return f"{n} receiver{'s' if n > 1 else ''}, noise like the mirrors'" if n else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         return [_of_calibration(plan, by_range, _diagonal(plan.calibration_thermal_m))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         world.calibration_m += world.plan.calibration_thermal_m * world.normal(*world.calibration_m.shape)
 
 
@@ -177,16 +177,16 @@ class CalibrationSurvey:
     name = "calibration survey"
     remedy = "survey the calibration receivers better; use more of them"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         return f"{1e3 * plan.survey_sigma_m.max():.3g} mm in each axis" if np.any(plan.survey_sigma_m > 0.0) else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         # its place is known with sigma in each axis; the solver assumes that sigma for each range
         n = len(plan.survey_sigma_m)
         root = np.einsum("cgta,c,cd->cgtda", plan.calibration_by_place, plan.survey_sigma_m, np.eye(n))
         return [_of_calibration(plan, by_range, root.reshape(*root.shape[:3], -1))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         world.calibration_enu_m += world.plan.survey_sigma_m[:, None] * world.normal(*world.calibration_enu_m.shape)
 
 
@@ -200,7 +200,7 @@ class TransmitterSurvey:
         sigma_mm = 1e3 * plan.scenario.budget.transmitter_survey_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         sigma = plan.scenario.budget.transmitter_survey_sigma_m
         direct = np.einsum("magrt,mgrtx->matx", by_range, plan.by_transmitter)
         found = [sigma * direct.reshape(*direct.shape[:2], -1)]
@@ -210,7 +210,7 @@ class TransmitterSurvey:
             found.append(_of_calibration(plan, by_range, root.reshape(*root.shape[:3], -1)).slope)
         return [Effect(np.sum(found, axis=0), common=True)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         sigma = world.plan.scenario.budget.transmitter_survey_sigma_m
         world.transmitter_enu_m += sigma * world.normal(*world.transmitter_enu_m.shape)
 
@@ -221,7 +221,7 @@ class Drift:
     name = "phase drift"
     remedy = "calibrate more often; thermostats or references at the transmitters"
 
-    def _sigma_m(self, plan: Plan) -> FloatArray:
+    def _sigma_m(self, plan: WorkingPoint) -> FloatArray:
         """(tone, transmitter)."""
         s = plan.scenario
         rate = s.simulation.transmitter_phase_drift_rad_per_sqrt_h / 60.0
@@ -231,7 +231,7 @@ class Drift:
             span = scale * (1.0 - np.exp(-age / scale))
         return np.asarray(rate * np.sqrt(span) * plan.waves.wavelength_m[: plan.waves.n_tone] / (2.0 * np.pi))
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         s = plan.scenario
         if not _calibrated(plan) or not np.any(self._sigma_m(plan) > 0.0):
             return ""
@@ -240,11 +240,11 @@ class Drift:
         rate = s.simulation.transmitter_phase_drift_rad_per_sqrt_h
         return f"{1e3 * rate:.3g} mrad/√h, calibration {s.budget.calibration_age_s:g} s old{levels}"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         slope = by_range[:, :, : plan.waves.n_tone].sum(axis=3) * self._sigma_m(plan)
         return [Effect(_flat(slope), common=True)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         sigma = self._sigma_m(world.plan)
         drift = sigma * world.normal(world.n_draw, *sigma.shape)
         world.range_m[:, :, : world.plan.waves.n_tone] += drift[:, None, :, None]
@@ -260,12 +260,12 @@ class ReceiverPlaces:
         sigma_mm = 1e3 * plan.scenario.budget.receiver_mirror_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         sigma = plan.scenario.budget.receiver_mirror_sigma_m
         slope = np.einsum("magrt,mgrtx,mxb->marb", by_range, plan.by_place, plan.mirrors.rot_enu_from_mirror)
         return [Effect(_flat(sigma * slope))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         sigma = world.plan.scenario.budget.receiver_mirror_sigma_m
         world.receiver_mirror_m += sigma * world.normal(*world.receiver_mirror_m.shape)
 
@@ -280,16 +280,16 @@ class Misalignment:
         sigma = plan.scenario.budget.receiver_plane_sigma_mrad
         return f"{sigma:.3g} mrad about each axis" if sigma > 0.0 else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         sigma = 1e-3 * plan.scenario.budget.receiver_plane_sigma_mrad
         return [_turned(plan, by_range, sigma)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         sigma = 1e-3 * world.plan.scenario.budget.receiver_plane_sigma_mrad
         world.glass_tilt_rad += sigma * world.normal(*world.glass_tilt_rad.shape)
 
 
-def _turned(plan: Plan, by_range: FloatArray, sigma_rad: float) -> Effect:
+def _turned(plan: WorkingPoint, by_range: FloatArray, sigma_rad: float) -> Effect:
     slope = np.zeros((*by_range.shape[:2], 2))
     slope[:, 0, 0] = slope[:, 1, 1] = sigma_rad
     return Effect(slope, past_solver=True)
@@ -301,14 +301,14 @@ class Pivot:
     name = "pivot survey"
     remedy = "survey the pivots better; with calibrated transmitters it may be left out"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         sigma = plan.estimator.pivot_sigma_m
         return f"{1e3 * sigma:.3g} mm in each axis" if plan.estimator.rigid and np.isfinite(sigma) else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         return [Effect(plan.estimator.pivot_sigma_m * by_pivot)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         world.surveyed_pivot_enu_m += world.plan.estimator.pivot_sigma_m * world.normal(
             *world.surveyed_pivot_enu_m.shape
         )
@@ -320,7 +320,7 @@ class GroundReflection:
     name = "ground reflection"
     remedy = 'model it ([budget] ground = "estimated"); survey the ground\'s height; antennas that do not see it'
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         ground, settings = plan.scenario.simulation.ground, plan.scenario.budget
         if ground is None:
             return ""
@@ -332,7 +332,7 @@ class GroundReflection:
             text += f" to {settings.ground_coefficient_sigma:g}"
         return f"{text}, height to {1e3 * settings.ground_height_sigma_m:g} mm"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         ground, settings = plan.scenario.simulation.ground, plan.scenario.budget
         assert ground is not None
         if not plan.reflects:
@@ -345,7 +345,7 @@ class GroundReflection:
             found.append(Effect(np.einsum("magrt,mgrtx->max", by_range, by_part), common=True))
         return found
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         settings = world.plan.scenario.budget
         world.with_ground = True
         if not world.plan.reflects:
@@ -362,10 +362,10 @@ class Reflections:
     name = "reflections of the site"
     remedy = "pose `site`, which has them in its model; its own budget says what they cost then"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         return "" if plan.stray_m is None else "rays foreseen from outlines and [site.structures]"
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         assert plan.stray_m is not None
         assert plan.calibration_stray_m is not None
         shift = plan.stray_m.copy()
@@ -375,7 +375,7 @@ class Reflections:
             )[:, None]
         return [Effect(np.einsum("magrt,mgrt->ma", by_range, shift)[..., None], common=True)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         plan = world.plan
         assert plan.stray_m is not None
         assert plan.calibration_stray_m is not None
@@ -389,11 +389,11 @@ class Multipath:
     name = "other multipath"
     remedy = "receivers clear of metal, antennas with a pattern; a larger modulation frequency; average over postures"
 
-    def assumed(self, plan: Plan) -> str:
+    def assumed(self, plan: WorkingPoint) -> str:
         s = plan.scenario.budget
         return "" if s.multipath_db is None else f"{s.multipath_db:g} dB, detour {s.multipath_excess_m:g} m on average"
 
-    def _root_m(self, plan: Plan) -> tuple[FloatArray, FloatArray]:
+    def _root_m(self, plan: WorkingPoint) -> tuple[FloatArray, FloatArray]:
         """Factor of the covariance of tones' shifts (tone, tone), and sigma of the carriers' (transmitter,) [m].
 
         A weak ray of relative amplitude a, phase α and detour Δ shifts a tone of wavenumber κ by a cos α sin(κΔ)/κ and
@@ -414,7 +414,7 @@ class Multipath:
         carrier_k = 2.0 * np.pi * plan.scenario.carrier_rf_hz / speed
         return vectors * np.sqrt(np.maximum(values, 0.0)), a / np.sqrt(2.0) / carrier_k
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         root, carrier = self._root_m(plan)
         n = plan.waves.n_tone
         found = [Effect(_flat(np.einsum("magrt,gx->marxt", by_range[:, :, :n], root)))]
@@ -426,7 +426,7 @@ class Multipath:
             found.append(_of_calibration(plan, by_range, each.reshape(*each.shape[:3], -1)))
         return found
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         s = world.plan.scenario.budget
         assert s.multipath_db is not None
         a = 10.0 ** (s.multipath_db / 20.0)
@@ -437,7 +437,7 @@ class Multipath:
             world.calibration_m += _stray_m(world, a, s.multipath_excess_m, shape, waves.tone_hz[: waves.n_tone])
 
 
-def _stray_m(world: World, a: float, excess_m: float, shape: tuple[int, ...], tone_hz: FloatArray) -> FloatArray:
+def _stray_m(world: DrawnSites, a: float, excess_m: float, shape: tuple[int, ...], tone_hz: FloatArray) -> FloatArray:
     """Exact shift of ranges (draw, place, group, …, transmitter) by one weak ray each; ``shape`` without the group."""
     phase = 2.0 * np.pi * world.rng.random(shape)
     detour = world.rng.exponential(excess_m, shape)
@@ -474,10 +474,10 @@ class Motion:
         frame_s = plan.scenario.radio.frame_samples / plan.scenario.radio.sample_rate_hz
         return f"{rate:.3g} mrad/s, frame of {1e3 * frame_s:g} ms" + (f", {latency:g} s later" if latency else "")
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         return [_turned(plan, by_range, self.angle_rad(plan) / np.sqrt(2.0))]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         direction = 2.0 * np.pi * world.rng.random(world.glass_tilt_rad.shape[:2])
         s = world.plan.scenario
         rate = 1e-3 * s.budget.mirror_rate_mrad_per_s
@@ -501,7 +501,7 @@ class Wavelength:
         sigma = self.sigma(plan)
         return f"refractive index to {1e6 * sigma:g} ppm" if sigma > 0.0 else ""
 
-    def effects(self, plan: Plan, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
+    def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
         transmitter = plan.scenario.transmitter_enu_m
         distance = np.linalg.norm(plan.mirrors.receiver_enu_m[:, :, None] - transmitter, axis=-1)
         slope = np.einsum("magrt,mrt->ma", by_range, distance)[..., None]
@@ -512,7 +512,7 @@ class Wavelength:
             found.append(_of_calibration(plan, by_range, self.sigma(plan) * root).slope)
         return [Effect(np.sum(found, axis=0), common=True)]
 
-    def disturb(self, world: World) -> None:
+    def disturb(self, world: DrawnSites) -> None:
         world.range_scale += self.sigma(world.plan) * world.normal(world.n_draw)
 
 

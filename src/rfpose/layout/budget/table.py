@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.layout.budget.plan import Plan
+from rfpose.layout.budget.plan import WorkingPoint
 from rfpose.layout.budget.sources import SOURCES, Effect, Source
-from rfpose.layout.budget.world import World
+from rfpose.layout.budget.world import DrawnSites
 from rfpose.layout.gain import Gain
 from rfpose.layout.maps import Mirrors
 
@@ -74,7 +74,7 @@ class ErrorBudget:
 
 
 def error_budget(
-    plan: Plan,
+    plan: WorkingPoint,
     *,
     n_draw: int = 200,
     seed: int = 0,
@@ -89,7 +89,7 @@ def error_budget(
     Parameters
     ----------
     plan
-        See `make_plan`.
+        See `working_point`.
     n_draw
         Frames drawn for each line and for the whole; 0 for none.
     seed
@@ -133,7 +133,7 @@ def error_budget(
     )
 
 
-def noise_bound(plan: Plan) -> FloatArray:
+def noise_bound(plan: WorkingPoint) -> FloatArray:
     """Return the rms angle of each normal (mirror,) [rad] that the solver itself will state.
 
     What `rfpose.layout.maps.normal_map` bounds, for any solver a plan can describe: reflections estimated, too.
@@ -192,14 +192,16 @@ def _covariance(effects: Sequence[Effect], gain: Gain) -> FloatArray:
     return out
 
 
-def _draw(plan: Plan, sources: Sequence[Source], n_draw: int, stream: np.random.SeedSequence) -> tuple[FloatArray, int]:
+def _draw(
+    plan: WorkingPoint, sources: Sequence[Source], n_draw: int, stream: np.random.SeedSequence
+) -> tuple[FloatArray, int]:
     """(mirror, 2, 2) mean square of the normal's error through the solver, NaN without draws; failed solutions."""
     n_mirror = len(plan.mirrors.pivot_enu_m)
     total, count = np.zeros((n_mirror, 2, 2)), np.zeros(n_mirror)
     rng = np.random.default_rng(stream)
     batch = max(1, _BATCH_RANGES // plan.thermal_m.size)
     for begin in range(0, n_draw, batch):
-        world = World(plan, min(batch, n_draw - begin), rng)
+        world = DrawnSites(plan, min(batch, n_draw - begin), rng)
         for source in sources:
             source.disturb(world)
         error = world.normal_errors()

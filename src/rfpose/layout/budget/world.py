@@ -11,19 +11,19 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp.calibration import PhaseAverage, average_phases
-from rfpose.layout.budget.plan import Plan
+from rfpose.layout.budget.plan import WorkingPoint
 from rfpose.multilat import range_differences, solve_poses
 from rfpose.multilat.ground import CalibrationSight, solve_with_ground
 from rfpose.multilat.rigid import solve_rigid
 
-__all__ = ["World"]
+__all__ = ["DrawnSites"]
 
 _NODES = np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
 _NODE_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 """Gauss-Legendre: instants of a frame that stand for its mean."""
 
 
-class World:
+class DrawnSites:
     """Several draws of a site with errors; sources add theirs before `normal_errors`.
 
     Attributes
@@ -52,7 +52,7 @@ class World:
         Whether the ground reflects, how (draw,), and how much higher it lies than assumed (draw,) [m].
     """
 
-    def __init__(self, plan: Plan, n_draw: int, rng: np.random.Generator) -> None:
+    def __init__(self, plan: WorkingPoint, n_draw: int, rng: np.random.Generator) -> None:
         self.plan, self.rng, self.n_draw = plan, rng, n_draw
         scenario, mirrors = plan.scenario, plan.mirrors
         n_mirror, n_group, n_receiver, n_transmitter = plan.thermal_m.shape

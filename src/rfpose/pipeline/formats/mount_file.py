@@ -19,7 +19,7 @@ import tomli_w
 from rfpose import __version__
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.feedback.calibrated import Choice, Known, resolve_free
+from rfpose.feedback.calibrated import Known, ParameterChoice, resolve_free
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
@@ -64,7 +64,7 @@ class StoredMount:
     column_length: FloatArray = field(default_factory=lambda: np.zeros(0))
     noise_rad: float = float("nan")
     noise_assumed: bool = False
-    choice: Choice | None = None
+    choice: ParameterChoice | None = None
     undetermined: tuple[tuple[str, ...], ...] = ()
 
     @property
@@ -293,12 +293,12 @@ def _not_negative(name: str, value: Any) -> float:
     return number
 
 
-def _stored_choice(table: Any, free: tuple[str, ...]) -> Choice | None:
+def _stored_choice(table: Any, free: tuple[str, ...]) -> ParameterChoice | None:
     if table is None:
         return None
     if not isinstance(table, Mapping) or not isinstance(table.get("held_out_rad"), Mapping):
         raise InvalidInputError(f"`choice` must be a table with chosen, reason, held_out_rad, got {table!r:.40}")
-    return Choice(
+    return ParameterChoice(
         chosen=str(table["chosen"]),
         free=free,
         held_out_rad={str(k): _not_negative(f"held_out_rad.{k}", v) for k, v in table["held_out_rad"].items()},

@@ -248,7 +248,7 @@ class DelayTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilteredTable:
-    """Poses filtered over frames, each of the frame's middle: `rfpose.multilat.TrackedPoses`.
+    """Poses filtered over frames, each of the frame's middle: `rfpose.multilat.FilteredPoses`.
 
     Attributes
     ----------
@@ -261,7 +261,7 @@ class FilteredTable:
     pivot_enu_m, rate_enu_radps : (frame, heliostat, xyz)
         Pivot [m]; turning rate [rad/s].
     status : (frame, heliostat)
-        `rfpose.multilat.TrackStatus`.
+        `rfpose.multilat.FilterStatus`.
     """
 
     normal_enu: FloatArray

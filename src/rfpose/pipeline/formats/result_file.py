@@ -19,7 +19,7 @@ from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
 from rfpose.errors import InvalidInputError, RfposeError
 from rfpose.files import write_atomically
 from rfpose.kinds import kind_of
-from rfpose.multilat import FixStatus, PoseStatus, RangeDifferences, RangeStatus, TrackStatus
+from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, RangeDifferences, RangeStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -168,7 +168,7 @@ KEYS: Mapping[str, Column] = {
     "filtered/sigma_rad": Column(_FH, "f8", "rad", "RMS angle of its error, both axes together"),
     "filtered/pivot_enu_m": Column((*_FH, "xyz"), "f8", "m", "filtered pivot, east, north, up"),
     "filtered/rate_enu_radps": Column((*_FH, "xyz"), "f8", "rad/s", "turning rate, about east, north, up"),
-    "filtered/status": Column(_FH, "i1", "code", "what became of the frame, 1 measured and taken in", TrackStatus),
+    "filtered/status": Column(_FH, "i1", "code", "what became of the frame, 1 measured and taken in", FilterStatus),
     "truth/frame_start_index": Column(("truth_frame",), "i8", "sample", "frames of the truth"),
     "truth/normal_enu": Column(("truth_frame", "heliostat", "xyz"), "f8", "1", "true mirror normal"),
     "truth/receiver_enu_m": Column(("truth_frame", "receiver", "xyz"), "f8", "m", "true receiver position"),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.dsp import LineStatus
-from rfpose.multilat import FixStatus, PoseStatus, TrackStatus
+from rfpose.multilat import FilterStatus, FixStatus, PoseStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -128,7 +128,7 @@ def _summary_of_filtered(table: FilteredTable) -> dict[str, Any]:
     sigma = table.sigma_rad[np.isfinite(table.sigma_rad)]
     counted = Counter(table.status.ravel().tolist())
     return {
-        "reasons": {TrackStatus(code).reason: n for code, n in counted.most_common()},
+        "reasons": {FilterStatus(code).reason: n for code, n in counted.most_common()},
         "sigma_mrad": 1e3 * float(np.median(sigma)) if sigma.size else None,
     }
 

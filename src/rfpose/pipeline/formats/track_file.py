@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.fieldcontrol.modes import Mode
-from rfpose.feedback.tracking import METHODS, Score, Simulation, score
+from rfpose.feedback.tracking import METHODS, Score, TrackingSimulation, score
 from rfpose.feedback.tracking.budget import track_budget
 from rfpose.feedback.tracking.loops import loop_margins_of
 from rfpose.files import write_atomically
@@ -294,7 +294,7 @@ class Track(Shown, Tabled):
         }
 
 
-def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequence[IqCheck] = ()) -> Track:
+def track_of(simulation: TrackingSimulation, settings: Mapping[str, str], *, iq: Sequence[IqCheck] = ()) -> Track:
     """Gather what a finished simulation found, and what samples of some of its mirrors did."""
     field = simulation.field
     target = field.target[:, :3].copy()
@@ -326,14 +326,14 @@ def track_of(simulation: Simulation, settings: Mapping[str, str], *, iq: Sequenc
     )
 
 
-def _foreseen(simulation: Simulation, method: str) -> dict[str, Any]:
+def _foreseen(simulation: TrackingSimulation, method: str) -> dict[str, Any]:
     """Return the error budget of a method, which knows nothing of the simulation."""
     budget = track_budget(simulation.scenario, method, count=len(simulation.field)).as_dict()
     del budget["method"]
     return {"budget": budget}
 
 
-def _over_the_year(simulation: Simulation, found: Score) -> dict[str, Any]:
+def _over_the_year(simulation: TrackingSimulation, found: Score) -> dict[str, Any]:
     """Return errors by season, and what days that stand for a year make of one: light caught and lost [kWh/m²]."""
     plan = simulation.scenario.tracking
     month = np.array([day.date.month for day in simulation.days])

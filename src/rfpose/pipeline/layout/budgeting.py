@@ -14,15 +14,15 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.layout.budget import (
     BudgetLine,
     ErrorBudget,
-    Plan,
     SiteMirrors,
     SitePlan,
+    WorkingPoint,
     converter_share_of,
     error_budget,
-    make_plan,
     site_budget,
+    working_point,
 )
-from rfpose.pipeline.layout.site import Field, Posture, Postures, Site, load_site, postures_of, stacked
+from rfpose.pipeline.layout.site import Field, FieldPosture, Postures, Site, load_site, postures_of, stacked
 from rfpose.pipeline.site import foreseen_mirrors, stray_ranges
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, number
@@ -179,9 +179,9 @@ def budget(
     return SiteBudget(scenario=site, posture_names=tuple(p.name for p in studied), budget=found)
 
 
-def _plan(site: Scenario, studied: list[Posture], pose: str) -> Plan:
+def _plan(site: Scenario, studied: list[FieldPosture], pose: str) -> WorkingPoint:
     """Return the working point of an estimator that knows straight rays, with what other rays do to it."""
-    plan = make_plan(site, stacked([p.mirrors for p in studied]), pose=pose)
+    plan = working_point(site, stacked([p.mirrors for p in studied]), pose=pose)
     shaped = site.site.structures.box or any(m.width_m is not None for m in site.mirrors)
     if not (shaped and site.has_rf_carriers):
         return plan
@@ -195,7 +195,7 @@ def _plan(site: Scenario, studied: list[Posture], pose: str) -> Plan:
     return replace(plan, stray_m=mirrors, calibration_stray_m=calibration)
 
 
-def _site_plan(site: Scenario, studied: list[Posture]) -> SitePlan:
+def _site_plan(site: Scenario, studied: list[FieldPosture]) -> SitePlan:
     """Foresee a field in all its postures."""
     parts, n = [], len(site.heliostat)
     for k, posture in enumerate(studied):
@@ -210,7 +210,7 @@ def _site_plan(site: Scenario, studied: list[Posture]) -> SitePlan:
     )
 
 
-def _refuse_blind(site: Scenario, found: ErrorBudget, studied: list[Posture]) -> None:
+def _refuse_blind(site: Scenario, found: ErrorBudget, studied: list[FieldPosture]) -> None:
     blind = np.flatnonzero(~np.isfinite(found.whole.normal_rad))
     if not blind.size:
         return

@@ -13,13 +13,13 @@ from rfpose.checks import FloatArray
 from rfpose.drawing import WIDTH_INCH, angle_unit, new_figure
 from rfpose.errors import ScenarioError
 from rfpose.layout import maps
-from rfpose.layout.budget import make_plan, noise_bound
+from rfpose.layout.budget import noise_bound, working_point
 from rfpose.layout.maps import ESTIMATORS, Study, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
 from rfpose.measurement import SCENARIO, first_snr
 from rfpose.multilat import PoseStatus
-from rfpose.pipeline.layout.site import Field, Posture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
+from rfpose.pipeline.layout.site import Field, FieldPosture, Postures, Sight, Site, Sun, load_site, postures_of, stacked
 from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
 from rfpose.scenario import Scenario, naming
 from rfpose.shown import Shown, counted, number
@@ -332,13 +332,13 @@ def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
     return ""
 
 
-def _with_reflection(scenario: Scenario, posture: Posture, tone_snr_db: float | None) -> FloatArray:
+def _with_reflection(scenario: Scenario, posture: FieldPosture, tone_snr_db: float | None) -> FloatArray:
     """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
     snr = {} if tone_snr_db is None else {"tone_snr_db": tone_snr_db}
-    return noise_bound(make_plan(scenario.changed(budget={"ground": "estimated"}, simulation=snr), posture.mirrors))
+    return noise_bound(working_point(scenario.changed(budget={"ground": "estimated"}, simulation=snr), posture.mirrors))
 
 
-def _with_site(scenario: Scenario, posture: Posture, tone_snr_db: float | None) -> SiteForecast:
+def _with_site(scenario: Scenario, posture: FieldPosture, tone_snr_db: float | None) -> SiteForecast:
     rot = np.concatenate([posture.mirrors.rot_enu_from_mirror, posture.plate_rot])
     from rfpose.pipeline.site import forecast_normals
 
@@ -376,7 +376,7 @@ def _some(n_posture: int) -> list[int]:
     return [int(k) for k in np.linspace(0, n_posture - 1, _MOST_LOST_POSTURES).round()]
 
 
-def _without_each(study: Study, postures: list[Posture], seen: list[BoolArray] | None) -> FloatArray:
+def _without_each(study: Study, postures: list[FieldPosture], seen: list[BoolArray] | None) -> FloatArray:
     """Rms over field and postures with each transmitter lost (transmitter,) [mrad]; with sight, of what is left."""
     sigma = np.concatenate(
         [

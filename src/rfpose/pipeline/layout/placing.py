@@ -30,7 +30,7 @@ from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.pipeline.layout.mapping import layout_map
 from rfpose.pipeline.layout.site import (
     Field,
-    Posture,
+    FieldPosture,
     Postures,
     Site,
     Sun,
@@ -336,7 +336,7 @@ class _Task:
     """A scenario made ready for placement."""
 
     scenario: Scenario
-    postures: tuple[Posture, ...]
+    postures: tuple[FieldPosture, ...]
     field: Mirrors
     constraints: Constraints
     suns: tuple[FloatArray, ...]

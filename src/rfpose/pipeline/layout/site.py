@@ -27,7 +27,18 @@ from rfpose.scenario import Scenario, naming, scenario_of
 from rfpose.sun import Site as SunSite
 from rfpose.sun import sun_position
 
-__all__ = ["Field", "Posture", "Postures", "Sight", "Site", "Sun", "load_site", "postures_of", "stacked", "suns_of"]
+__all__ = [
+    "Field",
+    "FieldPosture",
+    "Postures",
+    "Sight",
+    "Site",
+    "Sun",
+    "load_site",
+    "postures_of",
+    "stacked",
+    "suns_of",
+]
 
 Site = Scenario | str | Path
 """A scenario, or the file of one."""
@@ -64,7 +75,7 @@ class Postures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Posture:
+class FieldPosture:
     """One posture of the whole field.
 
     Attributes
@@ -125,7 +136,7 @@ def suns_of(scenario: Scenario, wanted: Postures) -> list[FloatArray]:
     return [_direction(sun) for sun in suns] or ([] if simulated is None else [simulated])
 
 
-def postures_of(scenario: Scenario, wanted: Postures) -> list[Posture]:
+def postures_of(scenario: Scenario, wanted: Postures) -> list[FieldPosture]:
     """Return the postures to study.
 
     Raises
@@ -149,7 +160,7 @@ def postures_of(scenario: Scenario, wanted: Postures) -> list[Posture]:
 
 def _posture(
     scenario: Scenario, name: str, *, sun_enu: FloatArray | None = None, normal_enu: FloatArray | None = None
-) -> Posture:
+) -> FieldPosture:
     mirrors = maps.mirrors_of(scenario, normal_enu=normal_enu, sun_enu=sun_enu)
     plates = scenario.site.structures.plate
     own = [None if sun_enu is not None or normal_enu is not None else p.normal_enu for p in plates]
@@ -161,7 +172,7 @@ def _posture(
     for i, told in enumerate(own):
         if told is not None:
             normal[i] = unit(told)
-    return Posture(name=name, mirrors=mirrors, plate_rot=rot_enu_from_mirror(normal))
+    return FieldPosture(name=name, mirrors=mirrors, plate_rot=rot_enu_from_mirror(normal))
 
 
 def _direction(sun_deg: Sun) -> FloatArray:

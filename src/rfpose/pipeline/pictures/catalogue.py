@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from rfpose.pipeline.pictures.track_view import TrackPicture
     from rfpose.recording import Recording
 
-__all__ = ["FIGURES", "Choice", "Opened", "draw", "opened_file"]
+__all__ = ["FIGURES", "FigureChoice", "Opened", "draw", "opened_file"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
+class FigureChoice:
     """What a figure shows; None: as the figure has it by itself.
 
     Attributes
@@ -125,7 +125,7 @@ def _evaluation(result: Result, truth: str | Path | None, *, follow_links: bool)
         return None
 
 
-def draw(file: Opened, what: str | None = None, choice: Choice | None = None) -> Figure:
+def draw(file: Opened, what: str | None = None, choice: FigureChoice | None = None) -> Figure:
     """Draw a figure of a file, by default the first that there is of its kind.
 
     Raises
@@ -133,7 +133,7 @@ def draw(file: Opened, what: str | None = None, choice: Choice | None = None) ->
     InvalidInputError
         There is no such figure of this kind of file, or it cannot show what is chosen.
     """
-    choice = choice or Choice()
+    choice = choice or FigureChoice()
     known = FIGURES[file.kind]
     name = what or next(iter(known))
     if name not in known:
@@ -145,7 +145,7 @@ def draw(file: Opened, what: str | None = None, choice: Choice | None = None) ->
     return drawer(file, choice)
 
 
-def _heliostat(file: Opened, choice: Choice) -> int | None:
+def _heliostat(file: Opened, choice: FigureChoice) -> int | None:
     if choice.heliostat is None:
         return None
     ids = file.heliostat_ids
@@ -155,7 +155,7 @@ def _heliostat(file: Opened, choice: Choice) -> int | None:
     return ids.index(choice.heliostat)
 
 
-def _map(file: Opened, choice: Choice) -> Figure:
+def _map(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_field_map
 
     assert file.result is not None
@@ -165,28 +165,28 @@ def _map(file: Opened, choice: Choice) -> Figure:
     )
 
 
-def _errors(file: Opened, _: Choice) -> Figure:
+def _errors(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_errors
 
     assert file.result is not None
     return draw_errors(file.result, evaluation=file.evaluation)
 
 
-def _links(file: Opened, _: Choice) -> Figure:
+def _links(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_links
 
     assert file.result is not None
     return draw_links(file.result)
 
 
-def _mirror(file: Opened, choice: Choice) -> Figure:
+def _mirror(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_mirror
 
     assert file.result is not None
     return draw_mirror(file.result, _heliostat(file, choice) or 0, frame=choice.frame)
 
 
-def _budget(file: Opened, _: Choice) -> Figure:
+def _budget(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.layout import budget
 
     assert file.scenario is not None
@@ -196,7 +196,7 @@ def _budget(file: Opened, _: Choice) -> Figure:
     return budget(file.scenario, pose=pose, n_draw=0).plot()
 
 
-def _layout(file: Opened, _: Choice) -> Figure:
+def _layout(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.layout import layout_map
 
     if file.scenario is None:
@@ -214,47 +214,47 @@ def _estimator(result: Result | None) -> str:
     return pose
 
 
-def _course(file: Opened, _: Choice) -> Figure:
+def _course(file: Opened, _: FigureChoice) -> Figure:
     assert file.track is not None
     return file.track.track.plot()
 
 
-def _methods(file: Opened, _: Choice) -> Figure:
+def _methods(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_methods
 
     assert file.track is not None
     return draw_methods(file.track.track)
 
 
-def _instant(file: Opened, choice: Choice) -> Figure:
+def _instant(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_instant
 
     assert file.track is not None
     return draw_instant(file.track, method=choice.method, instant=choice.frame, chosen=_heliostat(file, choice))
 
 
-def _mirror_course(file: Opened, choice: Choice) -> Figure:
+def _mirror_course(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_mirror_course
 
     assert file.track is not None
     return draw_mirror_course(file.track, _heliostat(file, choice) or 0)
 
 
-def _spectrum(file: Opened, choice: Choice) -> Figure:
+def _spectrum(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.recordings import draw_band
 
     assert file.recording is not None
     return draw_band(file.recording, receiver_id=choice.receiver, frame=choice.frame or 0)
 
 
-def _waterfall(file: Opened, choice: Choice) -> Figure:
+def _waterfall(file: Opened, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.recordings import draw_waterfall
 
     assert file.recording is not None
     return draw_waterfall(file.recording, receiver_id=choice.receiver)
 
 
-_Drawer = Callable[[Opened, Choice], "Figure"]
+_Drawer = Callable[[Opened, FigureChoice], "Figure"]
 
 FIGURES: Mapping[str, Mapping[str, tuple[tuple[str, ...], _Drawer]]] = {
     "result": {
@@ -279,4 +279,4 @@ FIGURES: Mapping[str, Mapping[str, tuple[tuple[str, ...], _Drawer]]] = {
     },
     "scenario": {"layout": ((), _layout), "budget": ((), _budget)},
 }
-"""By kind of file and name: what of a `Choice` a figure takes, and what draws it."""
+"""By kind of file and name: what of a `FigureChoice` a figure takes, and what draws it."""

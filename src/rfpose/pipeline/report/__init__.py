@@ -11,7 +11,7 @@ from pathlib import Path
 from rfpose import __version__
 from rfpose.drawing import look, svg_of
 from rfpose.errors import InvalidInputError, RfposeError
-from rfpose.pipeline.pictures.catalogue import Choice, Opened, draw, opened_file
+from rfpose.pipeline.pictures.catalogue import FigureChoice, Opened, draw, opened_file
 from rfpose.pipeline.report import page
 from rfpose.pipeline.report.others import recording_parts, scenario_parts
 from rfpose.pipeline.report.results import mirror_table, result_parts
@@ -90,39 +90,41 @@ def _parts(file: Opened) -> tuple[str, list[str], Mapping[str, str]]:
     return (*scenario_parts(file.scenario), {})
 
 
-def _figures(file: Opened, choice: ReportChoice) -> list[tuple[str, Choice, str]]:
+def _figures(file: Opened, choice: ReportChoice) -> list[tuple[str, FigureChoice, str]]:
     """Return which figures are drawn: name, choice, caption; those of chosen mirrors last."""
-    found: list[tuple[str, Choice, str]]
+    found: list[tuple[str, FigureChoice, str]]
     if file.result is not None:
         of = "error against the truth" if file.evaluation is not None else "sigma that the result states"
-        found = [("map", Choice(), f"The field from above; colours: {of}.")]
-        found += [("map", Choice(frame=k), f"The field in frame {k + 1}; colours: {of}.") for k in choice.frames]
-        found.append(("errors", Choice(), "How good the normals are, by mirror and over the frames."))
-        found.append(("links", Choice(), "What became of each transmitter at the mirrors' receivers."))
+        found = [("map", FigureChoice(), f"The field from above; colours: {of}.")]
+        found += [("map", FigureChoice(frame=k), f"The field in frame {k + 1}; colours: {of}.") for k in choice.frames]
+        found.append(("errors", FigureChoice(), "How good the normals are, by mirror and over the frames."))
+        found.append(("links", FigureChoice(), "What became of each transmitter at the mirrors' receivers."))
         if file.result.settings.get("pose") != "site":
             text = (
                 "Where errors come from, by the scenario's [budget], to first order: what this recording cannot show."
             )
-            found.append(("budget", Choice(), text))
+            found.append(("budget", FigureChoice(), text))
     elif file.track is not None:
-        found = [("methods", Choice(), "How the methods compare, the one that catches most light first.")]
-        found.append(("course", Choice(), "Errors, light and modes in the course of the first day; errors by mirror."))
-        instants = [Choice(frame=k) for k in choice.frames] or [Choice()]
+        found = [("methods", FigureChoice(), "How the methods compare, the one that catches most light first.")]
+        found.append(
+            ("course", FigureChoice(), "Errors, light and modes in the course of the first day; errors by mirror.")
+        )
+        instants = [FigureChoice(frame=k) for k in choice.frames] or [FigureChoice()]
         found += [("instant", each, "Mirrors and their beams at one instant.") for each in instants]
     elif file.recording is not None:
-        frames = [Choice(frame=k) for k in choice.frames] or [Choice()]
+        frames = [FigureChoice(frame=k) for k in choice.frames] or [FigureChoice()]
         found = [("spectrum", each, "What the band holds in one frame.") for each in frames]
-        found.append(("waterfall", Choice(), "What the band holds over the frames."))
+        found.append(("waterfall", FigureChoice(), "What the band holds over the frames."))
     else:
-        found = [("layout", Choice(), "What each mirror's normal can be known to, in the scenario's posture.")]
-        found.append(("budget", Choice(), "Where errors come from, to first order."))
+        found = [("layout", FigureChoice(), "What each mirror's normal can be known to, in the scenario's posture.")]
+        found.append(("budget", FigureChoice(), "Where errors come from, to first order."))
     by_mirror = file.result is not None or file.track is not None
     if choice.heliostats and not by_mirror:
         raise InvalidInputError(f"{file.path}: pages of mirrors are of results and tracking runs; leave them out")
-    return found + [("mirror", Choice(heliostat=name), "") for name in choice.heliostats]
+    return found + [("mirror", FigureChoice(heliostat=name), "") for name in choice.heliostats]
 
 
-def _figure(file: Opened, what: str, choice: Choice, caption: str, *, name: str) -> str:
+def _figure(file: Opened, what: str, choice: FigureChoice, caption: str, *, name: str) -> str:
     """Return a figure in HTML; where it cannot be drawn, the reason."""
     try:
         with look("page"):

@@ -12,7 +12,7 @@ from rfpose.multilat.estimation import protected, without_vague
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import FixTable, PoseTable
 from rfpose.pipeline.mirrors import mirror_groups
-from rfpose.pipeline.rigid.inputs import Stages, solve_group
+from rfpose.pipeline.rigid.inputs import RigidInputs, solve_group
 from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
 from rfpose.scenario import Scenario
 
@@ -48,7 +48,9 @@ def solve_rigid_poses(
     sample_rate
         Of the recording, for the time between frames [1/s].
     """
-    stages = Stages(tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice)
+    stages = RigidInputs(
+        tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice
+    )
     tables = Tables(stages, independent)
     start = tones.frame_start_index
     time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])

@@ -26,7 +26,7 @@ _VAGUE_RATIO = 100.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stages:
+class RigidInputs:
     """What the stages before found, and how to go on."""
 
     tones: TonePhases
@@ -54,17 +54,17 @@ class Stages:
         )
 
 
-def solve_group(stages: Stages, group: MirrorGroup) -> Found:
+def solve_group(inputs: RigidInputs, group: MirrorGroup) -> Found:
     """Solve one group of mirrors by the chosen estimator."""
-    problem = problem_of(stages, group)
-    if stages.choice.reflection == "none":
-        return solve_direct(problem, stages.alarms, _either_side(stages, group, problem))
-    scenario, tones = stages.scenario, stages.tones
-    row = np.arange(len(problem.range_m)).reshape(stages.n_frame, -1)
+    problem = problem_of(inputs, group)
+    if inputs.choice.reflection == "none":
+        return solve_direct(problem, inputs.alarms, _either_side(inputs, group, problem))
+    scenario, tones = inputs.scenario, inputs.tones
+    row = np.arange(len(problem.range_m)).reshape(inputs.n_frame, -1)
     frame, heliostat = (index.ravel() for index in np.indices(row.shape))
     average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
     reflections = Reflections(
-        reflectors=reflectors_of(scenario, stages.choice.reflection),
+        reflectors=reflectors_of(scenario, inputs.choice.reflection),
         carrier_rf_hz=scenario.carrier_rf_hz,
         calibration=calibration_sight(average, scenario, frame),
         free_space=scenario.reflection.spreading == "free_space",
@@ -73,28 +73,28 @@ def solve_group(stages: Stages, group: MirrorGroup) -> Found:
     return solve_two_ray(
         problem,
         reflections,
-        stages.alarms,
-        surveyed_enu_m=np.tile(group.pivot_enu_m, (stages.n_frame, 1)),
+        inputs.alarms,
+        surveyed_enu_m=np.tile(group.pivot_enu_m, (inputs.n_frame, 1)),
         heliostat=heliostat,
         shared={"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared],
     )
 
 
-def problem_of(stages: Stages, group: MirrorGroup) -> MirrorProblem:
+def problem_of(inputs: RigidInputs, group: MirrorGroup) -> MirrorProblem:
     """Return the problem that a group's mirrors pose, one row a frame and heliostat."""
-    places = np.tile(group.places_m, (stages.n_frame, 1, 1))
-    pivot, rot = align_points(places, _located(stages, group))
+    places = np.tile(group.places_m, (inputs.n_frame, 1, 1))
+    pivot, rot = align_points(places, _located(inputs, group))
     problem = MirrorProblem.of_observations(
-        stages.scenario.transmitter_enu_m,
+        inputs.scenario.transmitter_enu_m,
         places,
-        observations(stages.tones, stages.calibration, stages.ranges, stages.scenario, group),
+        observations(inputs.tones, inputs.calibration, inputs.ranges, inputs.scenario, group),
         start_pivot_enu_m=pivot,
         start_rot_enu_from_mirror=rot,
-        knowledge=group.knowledge(stages.n_frame),
+        knowledge=group.knowledge(inputs.n_frame),
     )
-    if stages.choice.reflection == "none":
+    if inputs.choice.reflection == "none":
         problem = _without_vague_calibration(problem)
-    known, weak = problem.knowledge, np.flatnonzero(_are_vague(stages, group, places))
+    known, weak = problem.knowledge, np.flatnonzero(_are_vague(inputs, group, places))
     if known.pivot_enu_m is not None and weak.size:
         pivot[weak] = known.pivot_enu_m[weak]
         rot[weak] = rotations_from_differences(
@@ -108,22 +108,22 @@ def problem_of(stages: Stages, group: MirrorGroup) -> MirrorProblem:
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
 
-def _located(stages: Stages, group: MirrorGroup) -> FloatArray:
+def _located(inputs: RigidInputs, group: MirrorGroup) -> FloatArray:
     """(mirror, receiver, xyz) where each receiver was located by itself [m]."""
-    return group.of_mirrors(stages.fixes.position_enu_m)
+    return group.of_mirrors(inputs.fixes.position_enu_m)
 
 
 def _either_side(
-    stages: Stages, group: MirrorGroup, problem: MirrorProblem
+    inputs: RigidInputs, group: MirrorGroup, problem: MirrorProblem
 ) -> Iterator[tuple[np.ndarray[tuple[int], np.dtype[np.int64]], MirrorProblem]]:
     """Mirrors with a fix that may be on either side of the transmitters' plane: all below it, then all above it."""
-    rows = np.flatnonzero((group.of_mirrors(stages.fixes.status) == FixStatus.AMBIGUOUS).any(axis=1))
+    rows = np.flatnonzero((group.of_mirrors(inputs.fixes.status) == FixStatus.AMBIGUOUS).any(axis=1))
     if not rows.size:
         return
     middle = problem.transmitter_enu_m.mean(axis=0)
     up = np.linalg.svd(problem.transmitter_enu_m - middle)[2][-1]
     up = up if up[2] >= 0.0 else -up
-    located = _located(stages, group)
+    located = _located(inputs, group)
     height = ((located - middle) @ up)[..., None]
     for sign in (-1.0, 1.0):
         pivot, rot = align_points(problem.receiver_mirror_m, located + (sign * np.abs(height) - height) * up)
@@ -140,11 +140,13 @@ def _without_vague_calibration(problem: MirrorProblem) -> MirrorProblem:
     return replace(problem, transmitter_sigma_m=np.where(vague, np.inf, common))
 
 
-def _are_vague(stages: Stages, group: MirrorGroup, places: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _are_vague(
+    inputs: RigidInputs, group: MirrorGroup, places: FloatArray
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """(mirror,) whether a receiver's fix, if there is one, is less certain than the mirror is wide.
 
     So it is without calibration receivers, or with a calibration that is old.
     """
-    variance = np.trace(group.of_mirrors(stages.fixes.cov_enu_m2), axis1=-2, axis2=-1)
+    variance = np.trace(group.of_mirrors(inputs.fixes.cov_enu_m2), axis1=-2, axis2=-1)
     width = np.linalg.norm(places - places.mean(axis=1, keepdims=True), axis=-1).max(axis=1)
     return np.asarray(~(np.sqrt(variance) < width[:, None]).all(axis=1))

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix
-from rfpose.multilat import Motion, PoseStatus, TrackStatus, track_poses
+from rfpose.multilat import FilterSettings, FilterStatus, PoseStatus, filter_poses
 from rfpose.multilat.estimation import Found
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
@@ -20,7 +20,7 @@ from rfpose.pipeline.mirrors import (
     MirrorGroup,
     mirror_groups,
 )
-from rfpose.pipeline.rigid.inputs import Stages
+from rfpose.pipeline.rigid.inputs import RigidInputs
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -40,7 +40,7 @@ class RigidOutcome:
 class Tables:
     """The result's tables, filled group by group."""
 
-    def __init__(self, stages: Stages, independent: PoseTable) -> None:
+    def __init__(self, stages: RigidInputs, independent: PoseTable) -> None:
         self._stages = stages
         scenario, choice = stages.scenario, stages.choice
         n_frame = self._n_frame = len(stages.tones.frame_start_index)
@@ -73,7 +73,7 @@ class Tables:
                     ("rate_enu_radps", (3,)),
                 )
             }
-            self._filtered["status"] = np.full(frame_mirror, TrackStatus.UNKNOWN, np.int8)
+            self._filtered["status"] = np.full(frame_mirror, FilterStatus.UNKNOWN, np.int8)
         self._delays: dict[str, npt.NDArray[Any]] = {}
         if any(group.learns_delays for group in mirror_groups(scenario)):
             n_clock = len(scenario.tone) + 1
@@ -144,14 +144,14 @@ class Tables:
             return array.reshape(self._n_frame, len(group.column), *array.shape[1:])
 
         poses, table = found.poses, self._stages.scenario.motion
-        tracked = track_poses(
+        tracked = filter_poses(
             by_frame(poses.pivot_enu_m),
             by_frame(poses.rot_enu_from_mirror),
             by_frame(poses.cov),
             time_s=time_s + 0.5 * exposure_s,
             exposure_s=exposure_s,
             usable=by_frame(found.status == PoseStatus.OK),
-            motion=Motion(
+            motion=FilterSettings(
                 rate_walk_radps_per_sqrt_s=table.rate_walk_radps_per_sqrt_s,
                 rate_sigma_radps=table.rate_sigma_radps,
                 gate_probability=table.gate_probability,

@@ -101,7 +101,7 @@ def _paint(folder: Path, seed: int) -> None:
 
 def _camera(folder: Path, seed: int) -> None:
     """Take pictures over a day: the heliostat is told to aim at the board's centre, and its counts are whole."""
-    from rfpose.feedback.camera.render import Beam, Target, View, render
+    from rfpose.feedback.camera.render import Beam, CameraView, Target, render
     from rfpose.feedback.optics import reflect, target_offset_m
 
     _planned(folder)
@@ -113,7 +113,7 @@ def _camera(folder: Path, seed: int) -> None:
         got = posture(TRUE, count)
         beam = reflect(got.normal_enu, sun)
         off = target_offset_m(got.centre_enu_m, beam, target_enu_m=BOARD_ENU_M, target_normal_enu=BOARD_NORMAL)
-        image = render(Target(), View(), Beam(centre_m=(float(off[0]), float(off[1]))), rng=rng)
+        image = render(Target(), CameraView(), Beam(centre_m=(float(off[0]), float(off[1]))), rng=rng)
         _save_png(folder / "pictures" / f"{i}.png", image)
         rows.append([f"{i}.png", _iso(unix_s), HELIOSTAT, *count.tolist()])
     _table(folder / "pictures" / "pictures.csv", "file,time_utc,heliostat,axis_1,axis_2", rows)

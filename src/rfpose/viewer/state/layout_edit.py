@@ -11,7 +11,7 @@ from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.scenario import Scenario, Transmitter
 from rfpose.viewer.models.live_layout import first_choice, free_carrier_hz, scenario_of_layout
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 
 __all__ = ["LayoutEdit"]
 
@@ -36,8 +36,8 @@ class LayoutEdit:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self.moved = Event()
-        self.chosen = Event()
+        self.moved = Signal()
+        self.chosen = Signal()
         self.scenario = scenario
         self.choice = first_choice(scenario)
         self.pivot_enu_m: FloatArray | None = None

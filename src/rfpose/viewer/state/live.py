@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from rfpose.viewer.models.live_track import LivePicture, LiveTrack
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 
 __all__ = ["FACTORS", "LiveRun"]
 
@@ -28,7 +28,7 @@ class LiveRun:
     """
 
     def __init__(self, track: LiveTrack) -> None:
-        self.changed = Event()
+        self.changed = Signal()
         self.track = track
         self.factor = 60.0
         self.picture: LivePicture | None = None

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Event"]
+__all__ = ["Signal"]
 
 Listener = Callable[..., Any]
 
 
-class Event:
+class Signal:
     """Something that happens; listeners are called in the order in which they came."""
 
     def __init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 
 __all__ = ["Playback"]
 
@@ -21,7 +21,7 @@ class Playback:
     """
 
     def __init__(self, n_frame: int = 0) -> None:
-        self.changed = Event()
+        self.changed = Signal()
         self._n_frame = max(0, n_frame)
         self._position = 0.0
         self._playing = False

@@ -7,7 +7,7 @@ from typing import Any
 
 from rfpose.viewer.state.document import Document
 from rfpose.viewer.state.layout_edit import LayoutEdit
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 from rfpose.viewer.state.playback import Playback
 
 __all__ = ["Message", "Selection", "Session"]
@@ -50,9 +50,9 @@ class Session:
     """
 
     def __init__(self) -> None:
-        self.opened = Event()
-        self.selected = Event()
-        self.said = Event()
+        self.opened = Signal()
+        self.selected = Signal()
+        self.said = Signal()
         self.document: Document | None = None
         self.layout: LayoutEdit | None = None
         self.playback = Playback()

@@ -26,7 +26,7 @@ from rfpose.multilat import PoseStatus
 from rfpose.pipeline.pictures.field_view import FieldPicture, History, history
 from rfpose.viewer.state.session import Selection, Session
 from rfpose.viewer.theme import Theme
-from rfpose.viewer.views.parts import Plan, Scale, Table, View, plot_in, segments
+from rfpose.viewer.views.parts import PlanPlot, Scale, Table, View, plot_in, segments
 from rfpose.viewer.views.space import Space
 from rfpose.viewer.workers import Workers
 
@@ -90,7 +90,7 @@ class FieldView(View):
             bar.addWidget(widget, 1 if widget is self.frame else 0)
         self.map = pg.GraphicsLayoutWidget()
         self.plan_plot = plot_in(self.map, theme, x="east [m]", y="north [m]")
-        self.plan = Plan(self.plan_plot, theme)
+        self.plan = PlanPlot(self.plan_plot, theme)
         self.plan.on_click(lambda i: self.session.select(heliostat=i))
         self.scale = Scale(self.map, theme)
         self.key = self.plan_plot.addLegend(offset=(8, 8), labelTextSize="8pt", brush=pg.mkBrush(theme.base))

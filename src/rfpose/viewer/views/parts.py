@@ -23,12 +23,12 @@ from PySide6.QtWidgets import (
 from rfpose.checks import FloatArray
 from rfpose.drawing import COLOUR_MAP, PINK, VERMILION
 from rfpose.pipeline.pictures.field_view import FieldPicture
-from rfpose.viewer.state.observed import Event
+from rfpose.viewer.state.observed import Signal
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import Theme, colour_table, see_through
 from rfpose.viewer.workers import Workers
 
-__all__ = ["Dots", "Plan", "Scale", "Table", "View", "keep_axes", "pick_on_click", "plot_in", "segments"]
+__all__ = ["Dots", "PlanPlot", "Scale", "Table", "View", "keep_axes", "pick_on_click", "plot_in", "segments"]
 
 _PICK_PX = 14.0
 _LEVELS = 64
@@ -50,7 +50,7 @@ class View(QWidget):
         self.session, self.workers, self.theme = session, workers, theme
         self._connections: list[Callable[[], None]] = []
 
-    def listen(self, event: Event, listener: Callable[..., Any]) -> None:
+    def listen(self, event: Signal, listener: Callable[..., Any]) -> None:
         """Observe until `release`."""
         self._connections.append(event.connect(listener))
 
@@ -224,7 +224,7 @@ class Scale:
         self.bar.setVisible(visible)
 
 
-class Plan:
+class PlanPlot:
     """The site from above, on a plot: transmitters, calibration receivers, heliostats with their normals."""
 
     def __init__(self, plot: Any, theme: Theme, *, names: bool = True) -> None:

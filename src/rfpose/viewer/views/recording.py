@@ -38,7 +38,7 @@ from rfpose.recording import describe
 from rfpose.viewer.state.document import Document
 from rfpose.viewer.state.session import Selection, Session
 from rfpose.viewer.theme import Theme
-from rfpose.viewer.views.parts import Plan, Table, View, plot_in
+from rfpose.viewer.views.parts import PlanPlot, Table, View, plot_in
 from rfpose.viewer.workers import Workers
 
 __all__ = ["RecordingView"]
@@ -177,7 +177,7 @@ class RecordingView(View):
             plot.getAxis("left").setWidth(58)
         self.side = pg.GraphicsLayoutWidget()
         self.plan_plot = plot_in(self.side, theme, x="east [m]", y="north [m]", row=0)
-        self.plan = Plan(self.plan_plot, theme)
+        self.plan = PlanPlot(self.plan_plot, theme)
         self.circle_plot = plot_in(self.side, theme, x="in phase (carrier's mean = 1)", y="quadrature", row=1)
         self.circle_plot.setAspectLocked(True)
         turn = np.linspace(0.0, 2.0 * np.pi, 181)

@@ -15,7 +15,7 @@ from rfpose.multilat.rigid._kernels import rotate
 
 N = 9
 
-# what became of a frame; `rfpose.multilat.tracking.TrackStatus` gives them names
+# what became of a frame; `rfpose.multilat.filtering.FilterStatus` gives them names
 UNKNOWN = 0
 UPDATED = 1
 STARTED = 2
@@ -229,7 +229,7 @@ def step_frame(
 
 
 @kernel_rows
-def track_many(
+def filter_many(
     begin, end,
     measured_pivot, measured_rot, noise, usable, exposure, walk_rate, walk_pivot, rate_variance, limits, max_coast,
     restart_after, delay, time, times, counts, pivot, rot, rate, cov, out_pivot, out_rot, out_rate, out_cov, status,

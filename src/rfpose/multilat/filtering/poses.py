@@ -10,15 +10,15 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.tracking import _kernels
+from rfpose.multilat.filtering import _kernels
 
-__all__ = ["Contradiction", "Motion", "TrackState", "TrackStatus", "TrackedPoses", "track_poses"]
+__all__ = ["Contradiction", "FilterSettings", "FilterState", "FilterStatus", "FilteredPoses", "filter_poses"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 
-class TrackStatus(IntEnum):
+class FilterStatus(IntEnum):
     """What became of one frame of one mirror; ``reason`` says it in words."""
 
     UNKNOWN = _kernels.UNKNOWN
@@ -51,7 +51,7 @@ class Contradiction(IntFlag):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Motion:
+class FilterSettings:
     """How mirrors move, and when a measurement is not believed.
 
     Attributes
@@ -92,7 +92,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackState:
+class FilterState:
     """All that the filter keeps of its mirrors between calls; arrays are read-only.
 
     Attributes
@@ -115,7 +115,7 @@ class TrackState:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackedPoses:
+class FilteredPoses:
     """Filtered poses, each at the instant ``time_s``; arrays are read-only.
 
     Attributes
@@ -130,7 +130,7 @@ class TrackedPoses:
     cov : (frame, mirror, 9, 9)
         Of pivot [m], rotation vector in ENU [rad] and rate [rad/s].
     status : (frame, mirror)
-        `TrackStatus`.
+        `FilterStatus`.
     distance2 : (frame, mirror)
         Squared Mahalanobis distance of the measured from the predicted pose, six degrees of freedom; NaN = no test.
     contradiction : (frame, mirror)
@@ -147,7 +147,7 @@ class TrackedPoses:
     status: IntArray
     distance2: FloatArray
     contradiction: IntArray
-    state: TrackState
+    state: FilterState
 
     @property
     def normal_enu(self) -> FloatArray:
@@ -162,7 +162,7 @@ class TrackedPoses:
         return np.asarray(np.sqrt(np.trace(turn, axis1=-2, axis2=-1) - about))
 
 
-def track_poses(
+def filter_poses(
     pivot_enu_m: npt.ArrayLike,
     rot_enu_from_mirror: npt.ArrayLike,
     cov: npt.ArrayLike,
@@ -170,10 +170,10 @@ def track_poses(
     time_s: npt.ArrayLike,
     exposure_s: float = 0.0,
     usable: npt.ArrayLike | None = None,
-    motion: Motion | None = None,
+    motion: FilterSettings | None = None,
     delay_s: float = 0.0,
-    state: TrackState | None = None,
-) -> TrackedPoses:
+    state: FilterState | None = None,
+) -> FilteredPoses:
     """Filter poses of single frames over time: a Kalman filter on rotation, rate and pivot of each mirror [1]_.
 
     Parameters
@@ -199,7 +199,7 @@ def track_poses(
 
     Returns
     -------
-    TrackedPoses
+    FilteredPoses
 
     Raises
     ------
@@ -226,7 +226,7 @@ def track_poses(
         raise InvalidInputError(f"`exposure_s` must be finite and not negative, got {exposure_s}")
     if not np.isfinite(delay_s):
         raise InvalidInputError(f"`delay_s` must be finite, got {delay_s}")
-    how = motion or Motion()
+    how = motion or FilterSettings()
     use = np.ones((n_frame, n_mirror), np.bool_) if usable is None else np.asarray(usable, np.bool_)
     if use.shape != (n_frame, n_mirror):
         raise InvalidInputError(f"`usable` must have shape {(n_frame, n_mirror)}, got {use.shape}")
@@ -235,7 +235,7 @@ def track_poses(
     shape = (n_frame, n_mirror)
     out = [np.full((*shape, *a.shape[1:]), np.nan) for a in now]
     status, parts, distance = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.full(shape, np.nan)
-    _kernels.track_many(
+    _kernels.filter_many(
         n_mirror,
         pivot,
         rot,
@@ -259,13 +259,13 @@ def track_poses(
         parts,
     )
     names = ("pivot_enu_m", "rot_enu_from_mirror", "rate_enu_radps", "cov")
-    return TrackedPoses(
+    return FilteredPoses(
         time_s=read_only(time + delay_s),
         **{name: read_only(a) for name, a in zip(names, out, strict=True)},
         status=read_only(status),
         distance2=read_only(distance),
         contradiction=read_only(parts),
-        state=TrackState(
+        state=FilterState(
             **{name: read_only(a) for name, a in zip(names, now, strict=True)},
             time_s=read_only(times),
             count=read_only(counts),
@@ -273,9 +273,9 @@ def track_poses(
     )
 
 
-def _nothing(n_mirror: int) -> TrackState:
+def _nothing(n_mirror: int) -> FilterState:
     """State before any measurement."""
-    return TrackState(
+    return FilterState(
         pivot_enu_m=np.zeros((n_mirror, 3)),
         rot_enu_from_mirror=np.tile(np.eye(3), (n_mirror, 1, 1)),
         rate_enu_radps=np.zeros((n_mirror, 3)),

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.tracking import Contradiction, Motion, TrackStatus, _kernels, track_poses
+from rfpose.multilat.filtering import Contradiction, FilterSettings, FilterStatus, _kernels, filter_poses
 
 SIGMA = np.array([2e-3, 2e-3, 5e-3, 4e-4, 6e-4, 3e-4])
 
@@ -77,14 +77,14 @@ def test_covariance_tells_the_truth(step, exposure, fine):
     rng = np.random.default_rng(4)
     n_mirror, walk = 600, 3e-5
     truth, data, cov = simulate(rng, 40, n_mirror, step=step, walk=walk, exposure=exposure, fine=fine, rate=1e-3)
-    found = track_poses(
+    found = filter_poses(
         *data,
         cov,
         time_s=step * np.arange(40),
         exposure_s=exposure,
-        motion=Motion(rate_walk_radps_per_sqrt_s=walk, rate_sigma_radps=1e-3),
+        motion=FilterSettings(rate_walk_radps_per_sqrt_s=walk, rate_sigma_radps=1e-3),
     )
-    assert np.all(found.status[0] == TrackStatus.STARTED)
+    assert np.all(found.status[0] == FilterStatus.STARTED)
     for frame in (0, 1, 5, 39):
         assert nees(found, truth)[frame].mean() == pytest.approx(9.0, rel=0.08)
     late = nees(found, truth, slice(20, None), slice(3, 6))
@@ -101,18 +101,24 @@ def test_outage_coasts_with_growing_covariance_that_is_true():
     truth, data, cov = simulate(rng, 40, 500, walk=walk)
     pivot, rot = np.array(data[0]), np.array(data[1])
     rot[lost] = np.nan
-    found = track_poses(pivot, rot, cov, time_s=10.0 * np.arange(40), motion=Motion(rate_walk_radps_per_sqrt_s=walk))
-    assert np.all(found.status[lost] == TrackStatus.COASTED)
+    found = filter_poses(
+        pivot, rot, cov, time_s=10.0 * np.arange(40), motion=FilterSettings(rate_walk_radps_per_sqrt_s=walk)
+    )
+    assert np.all(found.status[lost] == FilterStatus.COASTED)
     assert np.all(np.diff(found.tilt_sigma_rad[19:32], axis=0) > 0)
     assert np.all(found.tilt_sigma_rad[32] < found.tilt_sigma_rad[31])
     assert nees(found, truth)[31].mean() == pytest.approx(9.0, rel=0.09)
-    limited = track_poses(
-        pivot, rot, cov, time_s=10.0 * np.arange(40), motion=Motion(rate_walk_radps_per_sqrt_s=walk, max_coast_s=55.0)
+    limited = filter_poses(
+        pivot,
+        rot,
+        cov,
+        time_s=10.0 * np.arange(40),
+        motion=FilterSettings(rate_walk_radps_per_sqrt_s=walk, max_coast_s=55.0),
     )
-    assert np.all(limited.status[24] == TrackStatus.COASTED)
-    assert np.all(limited.status[25:32] == TrackStatus.LOST)
+    assert np.all(limited.status[24] == FilterStatus.COASTED)
+    assert np.all(limited.status[25:32] == FilterStatus.LOST)
     assert np.isnan(limited.normal_enu[25:32]).all()
-    assert np.all(limited.status[32] == TrackStatus.RESTARTED)
+    assert np.all(limited.status[32] == FilterStatus.RESTARTED)
 
 
 def test_outliers_are_left_out_and_a_jump_is_believed():
@@ -123,19 +129,21 @@ def test_outliers_are_left_out_and_a_jump_is_believed():
     rot[12, 0] = turn @ rot[12, 0]
     pivot[12, 1] += [0.5, 0, 0]
     rot[20:, 2] = turn @ rot[20:, 2]
-    found = track_poses(pivot, rot, cov, time_s=10.0 * np.arange(30), motion=Motion(rate_walk_radps_per_sqrt_s=3e-6))
-    assert found.status[12, 0] == found.status[12, 1] == TrackStatus.GATED
+    found = filter_poses(
+        pivot, rot, cov, time_s=10.0 * np.arange(30), motion=FilterSettings(rate_walk_radps_per_sqrt_s=3e-6)
+    )
+    assert found.status[12, 0] == found.status[12, 1] == FilterStatus.GATED
     assert Contradiction(found.contradiction[12, 0]) & Contradiction.ROTATION
     assert Contradiction(found.contradiction[12, 1]) & Contradiction.POSITION
     assert list(found.status[19:24, 2]) == [
-        TrackStatus.UPDATED,
-        TrackStatus.GATED,
-        TrackStatus.GATED,
-        TrackStatus.RESTARTED,
-        TrackStatus.UPDATED,
+        FilterStatus.UPDATED,
+        FilterStatus.GATED,
+        FilterStatus.GATED,
+        FilterStatus.RESTARTED,
+        FilterStatus.UPDATED,
     ]
     others = np.delete(found.status[1:], [0, 1, 2], axis=1)
-    assert np.all(others == TrackStatus.UPDATED)  # 1 350 tests at 1e-6
+    assert np.all(others == FilterStatus.UPDATED)  # 1 350 tests at 1e-6
     assert nees(found, truth)[12, :2].max() < chi2.isf(1e-6, 9)
 
 
@@ -146,8 +154,8 @@ def test_the_instant_is_the_one_that_is_said():
     first = Rotation.from_matrix(rot_enu_from_mirror([0.2, 0.5, 0.8]))
     rot = (Rotation.from_rotvec(time[:, None] * rate) * first).as_matrix()[:, None]
     cov = np.broadcast_to(np.diag(np.full(6, 1e-14)), (20, 1, 6, 6))
-    motion = Motion(rate_walk_radps_per_sqrt_s=1e-9)
-    found = track_poses(np.zeros((20, 1, 3)), rot, cov, time_s=time, delay_s=30.0, motion=motion)
+    motion = FilterSettings(rate_walk_radps_per_sqrt_s=1e-9)
+    found = filter_poses(np.zeros((20, 1, 3)), rot, cov, time_s=time, delay_s=30.0, motion=motion)
     assert found.time_s[-1] == time[-1] + 30.0
     expected = (Rotation.from_rotvec((time[-1] + 30.0) * rate) * first).as_matrix()
     np.testing.assert_allclose(found.rot_enu_from_mirror[-1, 0], expected, atol=1e-8)
@@ -159,10 +167,10 @@ def test_many_calls_equal_one():
     _, (pivot, rot), cov = simulate(rng, 12, 20)
     pivot[5, 3], rot[7:9, 4] = np.nan, np.nan
     time = 10.0 * np.arange(12)
-    whole = track_poses(pivot, rot, cov, time_s=time)
+    whole = filter_poses(pivot, rot, cov, time_s=time)
     state, rows = None, []
     for k in range(12):
-        found = track_poses(pivot[k : k + 1], rot[k : k + 1], cov[k : k + 1], time_s=time[k : k + 1], state=state)
+        found = filter_poses(pivot[k : k + 1], rot[k : k + 1], cov[k : k + 1], time_s=time[k : k + 1], state=state)
         state = found.state
         rows.append(found.rot_enu_from_mirror[0])
     np.testing.assert_array_equal(np.array(rows), whole.rot_enu_from_mirror)
@@ -174,12 +182,12 @@ def test_marked_measurements_and_missing_starts():
     _, (pivot, rot), cov = simulate(rng, 4, 2)
     usable = np.ones((4, 2), bool)
     usable[:2, 1] = False
-    found = track_poses(pivot, rot, cov, time_s=np.arange(4.0), usable=usable)
+    found = filter_poses(pivot, rot, cov, time_s=np.arange(4.0), usable=usable)
     assert list(found.status[:, 1]) == [
-        TrackStatus.UNKNOWN,
-        TrackStatus.UNKNOWN,
-        TrackStatus.STARTED,
-        TrackStatus.UPDATED,
+        FilterStatus.UNKNOWN,
+        FilterStatus.UNKNOWN,
+        FilterStatus.STARTED,
+        FilterStatus.UPDATED,
     ]
     assert np.isnan(found.tilt_sigma_rad[:2, 1]).all()
 
@@ -195,11 +203,11 @@ def test_logarithm_of_rotations():
 def test_bad_arguments():
     good = (np.zeros((2, 1, 3)), np.tile(np.eye(3), (2, 1, 1, 1)), np.tile(np.eye(6), (2, 1, 1, 1)))
     with pytest.raises(InvalidInputError, match="time_s"):
-        track_poses(*good, time_s=[1.0, 1.0])
+        filter_poses(*good, time_s=[1.0, 1.0])
     with pytest.raises(InvalidInputError, match="exposure_s"):
-        track_poses(*good, time_s=[0.0, 1.0], exposure_s=-1.0)
+        filter_poses(*good, time_s=[0.0, 1.0], exposure_s=-1.0)
     with pytest.raises(InvalidInputError, match="gate_probability"):
-        Motion(gate_probability=0.0)
-    earlier = track_poses(*good, time_s=[0.0, 1.0]).state
+        FilterSettings(gate_probability=0.0)
+    earlier = filter_poses(*good, time_s=[0.0, 1.0]).state
     with pytest.raises(InvalidInputError, match="increase"):
-        track_poses(*good, time_s=[1.0, 2.0], state=earlier)
+        filter_poses(*good, time_s=[1.0, 2.0], state=earlier)
