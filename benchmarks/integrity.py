@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.hypotheses import Problem, judge, limit, noncentrality
+from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
+from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
 from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
@@ -51,7 +51,7 @@ class Field:
 
     def solve(self, z: np.ndarray, **more: float) -> GuardedPoses:
         """Solve with tests."""
-        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), **more)
+        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), Alarms(**more))
 
     def plain(self, z: np.ndarray) -> np.ndarray:
         """Errors of the normal without any test [rad]."""
@@ -193,14 +193,14 @@ def worst_direction(n: int, seed: int, *, shared: bool) -> tuple[Field, np.ndarr
     mirrors = field(n, np.random.default_rng(seed), shared=shared, noise=0.0)
     who = mirrors.solve(mirrors.z).worst_transmitter
     rng = np.random.default_rng(seed + 1)
-    problem = Problem.of(MirrorProblem.of(TRANSMITTER, PLACES, mirrors.z, **mirrors.settings))
     at = np.arange(n)
     best, best_slope = np.zeros_like(mirrors.z), np.zeros(n)
     for _ in range(40):
         error = np.zeros_like(mirrors.z)
         error[at, 0, :, who] = SIGMA * rng.standard_normal((n, 3))
-        poses = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, mirrors.z + error, **mirrors.settings))
-        verdict = judge(replace(problem, z=mirrors.z + error), poses)
+        problem = MirrorProblem.of(TRANSMITTER, PLACES, mirrors.z + error, **mirrors.settings)
+        poses = solve_rigid(problem)
+        verdict = judge(problem, poses)
         stat = verdict.stat[at, who]
         slope = mirrors.error(poses.normal_enu) / np.sqrt(stat)
         better = slope > best_slope

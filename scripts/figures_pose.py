@@ -16,7 +16,7 @@ import numpy as np
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.ground import Reflector, range_shift_m, solve_with_ground
-from rfpose.multilat.integrity import IntegrityStatus, solve_with_integrity
+from rfpose.multilat.integrity import Alarms, IntegrityStatus, solve_with_integrity
 from rfpose.multilat.rigid import (
     Knowledge,
     MirrorProblem,
@@ -299,7 +299,9 @@ def integrity(directory: Path) -> None:
         who = rng.integers(0, 10, n)
         z[np.arange(n), :, who] += size * RANGE_SIGMA_M * rng.choice([-1.0, 1.0], (n, 3))
         raw = solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z[:, None], **common))
-        safe = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z[:, None], **common), false_alarm=1e-3)
+        safe = solve_with_integrity(
+            MirrorProblem.of(TRANSMITTER, PLACES, z[:, None], **common), Alarms(false_alarm=1e-3)
+        )
         ruined = angle_between_rad(raw.normal_enu, rot[:, :, 2])
         plain.append(rms(ruined[np.isfinite(ruined)]))
         off = angle_between_rad(safe.poses.normal_enu, rot[:, :, 2])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.hypotheses import Problem, judge, limit, noncentrality
+from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus, solve_with_integrity
+from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
 from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 
@@ -51,13 +51,13 @@ class Field:
         }
 
     def guarded(self, z, **more):
-        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), **more)
+        return solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings), Alarms(**more))
 
     def plain(self, z):
         return solve_rigid(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings))
 
     def problem(self, z):
-        return Problem.of(MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings))
+        return MirrorProblem.of(TRANSMITTER, PLACES, z, **self.settings)
 
     def judged(self, z, poses):
         return judge(self.problem(z), poses)
@@ -80,7 +80,7 @@ def test_without_errors_every_statistic_is_chi2_and_alarms_are_as_rare_as_stated
     for stat, dof in ((verdict.stat, verdict.dof), (verdict.link, verdict.link_dof)):
         mean, expected = stat.mean(axis=0), dof[0]
         assert np.all(np.abs(mean - expected) < 5.0 * np.sqrt(2.0 * expected / n) + 1e-9)
-    dof = field.problem(field.z).dof()
+    dof = field.problem(field.z).dof
     assert poses.chi2.mean() == pytest.approx(dof[0], abs=5.0 * np.sqrt(2.0 * dof[0] / n))
     found = field.guarded(field.z, false_alarm=0.05)
     assert np.mean(found.status != IntegrityStatus.OK) < 0.05 + 5.0 * np.sqrt(0.05 / n)

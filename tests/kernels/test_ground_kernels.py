@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfpose.multilat.ground import Reflector, Surface, _kernels, _problem, model
+from rfpose.multilat.equations import rotate
+from rfpose.multilat.ground import Reflector, Surface, _problem, model
 from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation
 
 SPEED = 299_792_458.0
@@ -51,10 +52,8 @@ def make_problem(planes, *, calibration=None, n_mirror=2):
     mirrors = MirrorProblem.of_observations(
         TRANSMITTER, PLACES, observations, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, knowledge=known
     )
-    problem, clock = _problem.build(
-        scene, mirrors, calibration=np.empty((0, 3)) if calibration is None else calibration
-    )
-    state = _problem.State.begin(pivot, rot, clock, np.zeros(n_mirror, np.int64), problem.n_parameter)
+    problem = _problem.build(scene, mirrors, calibration=np.empty((0, 3)) if calibration is None else calibration)
+    state = problem.begin(pivot, rot, np.zeros(n_mirror, np.int64))
     return problem, state
 
 
@@ -66,7 +65,7 @@ def turned(state, m, axis, step):
         theta = np.zeros(3)
         theta[axis - 3] = step
         rot = np.empty((3, 3))
-        _kernels.rotate(theta, state.rot[m], rot)
+        rotate(theta, state.rot[m], rot)
         out.rot[m] = rot
     return out
 
@@ -97,7 +96,8 @@ def test_covariance_with_estimated_coefficient_is_that_of_one_large_matrix():
     predicted, slope = problem.predict(state, parameter)
     # measurements that fit exactly, so that the fit stays where it is
     state.clock[:] = 0.0
-    mirrors = problem.mirrors._replace(z=predicted + 0.7, clock_prior=np.zeros_like(state.clock))
+    prior = problem.mirrors.prior._replace(clock=np.zeros_like(state.clock))
+    mirrors = problem.mirrors._replace(z=predicted + 0.7, prior=prior)
     problem = replace(problem, mirrors=mirrors)
     problem.fit(state, parameter)
     assert (state.status == 0).all()

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import rot_enu_from_mirror
+from rfpose.multilat.equations import _kernels as equations
+from rfpose.multilat.reflection import direct_rays
+from rfpose.multilat.reflection._kernels import work_for
 from rfpose.multilat.rigid import _kernels
 
 RNG = np.random.default_rng(0)
@@ -13,14 +16,15 @@ PIVOT, ROT = np.array([5.0, -20.0, 2.0]), rot_enu_from_mirror([0.2, 0.7, 0.6])
 
 
 def ranges(pivot, rot):
-    distance, slope = np.empty((3, 7)), np.empty((3, 7, 6))
-    _kernels.ranges_and_slopes(TRANSMITTER, PLACES, pivot, rot, distance, slope)
-    return distance, slope
+    distance, slope = np.empty((1, 3, 7)), np.empty((1, 3, 7, 6))
+    scene = direct_rays(TRANSMITTER, 1)
+    _kernels.predict(scene, scene.common[0], work_for(0), PLACES, pivot, rot, distance, slope)
+    return distance[0], slope[0]
 
 
 def turned(theta):
     out = np.empty((3, 3))
-    _kernels.rotate(np.asarray(theta, float), ROT, out)
+    equations.rotate(np.asarray(theta, float), ROT, out)
     return out
 
 
@@ -32,7 +36,7 @@ def test_rotation_is_the_matrix_exponential():
         expected = Rotation.from_rotvec(theta).as_matrix() @ ROT
         np.testing.assert_allclose(turned(theta), expected, atol=1e-14)
         out = np.empty((3, 3))
-        _kernels.rotate.py_func(theta, ROT, out)
+        equations.rotate.py_func(theta, ROT, out)
         np.testing.assert_allclose(out, expected, atol=1e-14)
 
 
@@ -59,8 +63,8 @@ def test_normal_equations_are_those_of_the_whole_system(bias_info):
     clock = RNG.standard_normal((2, 3))
     info, gradient = np.zeros((12, 12)), np.zeros(12)
     info_of_bias = np.full((2, 7), bias_info)
-    args = (z, weight, info_of_bias, np.array([0, 1]), distance, slope, clock)
-    chi2 = _kernels.normal_equations(*args, info, gradient)
+    args = (z, weight, info_of_bias, np.array([0, 1]), distance[None], slope[None], clock)
+    chi2 = equations.normal_equations(*args, info, gradient)
 
     n_bias = 14
     jacobian, left, w = [], [], []
@@ -90,7 +94,7 @@ def test_normal_equations_are_those_of_the_whole_system(bias_info):
     if np.isfinite(bias_info):
         assert chi2 == pytest.approx(expected_chi2, rel=1e-9)
     twin_info, twin_gradient = np.zeros((12, 12)), np.zeros(12)
-    _kernels.normal_equations.py_func(*args, twin_info, twin_gradient)
+    equations.normal_equations.py_func(*args, twin_info, twin_gradient)
     np.testing.assert_allclose(twin_info, info, atol=1e-9)
     np.testing.assert_allclose(twin_gradient, gradient, atol=1e-9)
 
@@ -99,11 +103,11 @@ def test_factor_solves_and_knows_singular_matrices():
     a = RNG.standard_normal((6, 9))
     matrix, b = a @ a.T, RNG.standard_normal(6)
     lower, x = matrix.copy(), b.copy()
-    assert _kernels.factor(lower, 1e-13)
-    _kernels.solve_factored(lower, x)
+    assert equations.factor(lower, 1e-13)
+    equations.solve_factored(lower, x)
     np.testing.assert_allclose(x, np.linalg.solve(matrix, b), rtol=1e-9)
     cov = np.empty((6, 6))
-    _kernels.pose_covariance(lower, cov)
+    equations.covariance(lower, cov)
     np.testing.assert_allclose(cov, np.linalg.inv(matrix), rtol=1e-9)
-    assert not _kernels.factor(a[:, :5] @ a[:, :5].T, 1e-13)
-    assert not _kernels.factor(np.zeros((3, 3)), 1e-13)
+    assert not equations.factor(a[:, :5] @ a[:, :5].T, 1e-13)
+    assert not equations.factor(np.zeros((3, 3)), 1e-13)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,6 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.estimation.found import (
     RESIDUAL_PROBABILITY,
-    Alarms,
     Found,
     are_doubted,
     joined,
@@ -19,7 +18,7 @@ from rfpose.multilat.estimation.found import (
     residual_probability,
 )
 from rfpose.multilat.fix import APART_SIGMA, DECISIVE_CHI2
-from rfpose.multilat.integrity import GuardedPoses, TransmitterStatus, solve_with_integrity
+from rfpose.multilat.integrity import Alarms, GuardedPoses, TransmitterStatus, solve_with_integrity
 from rfpose.multilat.rigid import MirrorProblem, solve_rigid
 from rfpose.multilat.rigid.integers import solve_ladder
 from rfpose.multilat.status import PoseStatus
@@ -87,7 +86,7 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> Found:
     first: GuardedPoses | None = None
     used = problem
     if alarms is not None:
-        first = solve_with_integrity(problem.groups(slice(1)), **asdict(alarms))
+        first = solve_with_integrity(problem.groups(slice(1)), alarms)
         used = problem.only(first.used)
     ladder = solve_ladder(used)
     resolved = replace(used, range_m=ladder.range_m)
@@ -104,7 +103,7 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> Found:
         found.status[(found.status == PoseStatus.OK) & (probability < RESIDUAL_PROBABILITY)] = PoseStatus.RESIDUAL
         return found
     climbed = resolved.started(ladder.poses.pivot_enu_m, ladder.poses.rot_enu_from_mirror)
-    guard = joined(first, solve_with_integrity(climbed, **asdict(alarms)))
+    guard = joined(first, solve_with_integrity(climbed, alarms))
     status = guard.poses.status.copy()
     status[(status == PoseStatus.OK) & are_doubted(guard)] = PoseStatus.UNEXPLAINED
     return replace(

@@ -17,7 +17,6 @@ from rfpose.multilat.status import PoseStatus
 
 __all__ = [
     "RESIDUAL_PROBABILITY",
-    "Alarms",
     "Found",
     "are_doubted",
     "joined",
@@ -32,15 +31,6 @@ RESIDUAL_PROBABILITY = 1e-9
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Alarms:
-    """When tests of residuals speak up; as in `rfpose.multilat.integrity.solve_with_integrity`."""
-
-    false_alarm: float
-    missed_detection: float
-    max_excluded: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

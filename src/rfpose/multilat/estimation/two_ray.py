@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.estimation.found import Alarms, Found, are_doubted, joined
+from rfpose.multilat.estimation.found import Found, are_doubted, joined
 from rfpose.multilat.ground import CalibrationSight, GroundSolution, Reflector, guard_with_ground, solve_with_ground
-from rfpose.multilat.integrity import GuardedPoses, IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import MirrorProblem, RigidPoses, solve_rigid
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.multilat.status import PoseStatus
@@ -108,12 +108,12 @@ def _two_ray_of(problem: MirrorProblem, reflections: Reflections, alarms: Alarms
     probability_all, probability_direct = solution.probability, solution.probability_direct
     guard: GuardedPoses | None = None
     if alarms is not None:
-        guard = guard_with_ground(solution, **asdict(alarms))
+        guard = guard_with_ground(solution, alarms)
         if np.any(guard.transmitter_status > TransmitterStatus.NOT_RECEIVED):
             first = guard
             kept = better.only(first.used).started(first.poses.pivot_enu_m, first.poses.rot_enu_from_mirror)
             solution = _solve_ground(kept, reflections)
-            guard = joined(first, guard_with_ground(solution, **asdict(alarms)))
+            guard = joined(first, guard_with_ground(solution, alarms))
     poses = solution.poses if guard is None else guard.poses
     status = solution.status.copy()
     if guard is not None:

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
-from rfpose.multilat.rigid._kernels import rotate
+from rfpose.multilat.equations._kernels import rotate
 
 N = 9
 

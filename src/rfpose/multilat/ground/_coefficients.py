@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.ground._problem import Problem, State
+from rfpose.multilat.ground._problem import Problem, follow
+from rfpose.multilat.rigid.fits import Fits
 from rfpose.multilat.status import has_start
 
 __all__ = ["MAX_CONDITION", "find", "information", "refine", "retry", "trusted"]
@@ -30,7 +31,7 @@ _FITS = 2.0
 """chi² over degrees of freedom of the middle mirror that leaves nothing to search for."""
 
 
-def find(problem: Problem, state: State, turn: FloatArray) -> FloatArray:
+def find(problem: Problem, state: Fits, turn: FloatArray) -> FloatArray:
     """Coefficients to start from: the best of a grid, tried on mirrors spread over the field.
 
     Parameters
@@ -70,7 +71,7 @@ def find(problem: Problem, state: State, turn: FloatArray) -> FloatArray:
     return best
 
 
-def refine(problem: Problem, state: State, parameter: FloatArray) -> FloatArray:
+def refine(problem: Problem, state: Fits, parameter: FloatArray) -> FloatArray:
     """Gauss-Newton on the coefficients from solved mirrors; ``state`` ends solved at what is returned."""
     if problem.n_parameter == 0:
         return parameter
@@ -83,14 +84,14 @@ def refine(problem: Problem, state: State, parameter: FloatArray) -> FloatArray:
         share = min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-300))
         if float(step @ rest) < 1e-3 and share == 1.0:
             # a thirtieth of a sigma: the linear step is exact enough
-            state.move(step)
+            follow(state, step)
             return parameter + step
         before = state.chi2[good].sum()
         cap = 1e3 * np.maximum(state.chi2, problem.dof)
         for _ in range(_MAX_HALVING):
             candidate = problem.clip(parameter + share * step)
             trial = state.copy()
-            trial.move(candidate - parameter)
+            follow(trial, candidate - parameter)
             problem.fit(trial, candidate)
             if np.minimum(trial.chi2, cap)[good].sum() <= before * (1.0 + 1e-9) + 1e-3:
                 break
@@ -102,7 +103,7 @@ def refine(problem: Problem, state: State, parameter: FloatArray) -> FloatArray:
     return parameter
 
 
-def retry(problem: Problem, start: State, state: State, parameter: FloatArray, turn: FloatArray) -> None:
+def retry(problem: Problem, start: Fits, state: Fits, parameter: FloatArray, turn: FloatArray) -> None:
     """Solve mirrors that failed, or fit far worse than the rest, again from starts turned about."""
     ratio = state.chi2 / np.maximum(problem.dof, 1.0)
     usual = _usual(problem, state)
@@ -118,17 +119,17 @@ def retry(problem: Problem, start: State, state: State, parameter: FloatArray, t
     state.put(rows[better], again.take(better))
 
 
-def trusted(problem: Problem, state: State) -> BoolArray:
+def trusted(problem: Problem, state: Fits) -> BoolArray:
     """(mirror,) those that may speak about coefficients: solved, and not fitting far worse than the rest."""
     return np.asarray((state.status == 0) & (state.chi2 / np.maximum(problem.dof, 1.0) <= _usual(problem, state)))
 
 
-def information(state: State, good: BoolArray) -> FloatArray:
+def information(state: Fits, good: BoolArray) -> FloatArray:
     """Return what mirrors say about the coefficients together: the inverse of their covariance."""
     return np.asarray(state.schur[good].sum(axis=0))
 
 
-def _usual(problem: Problem, state: State) -> FloatArray:
+def _usual(problem: Problem, state: Fits) -> FloatArray:
     """(mirror,) largest chi² over degrees of freedom that is not out of the ordinary."""
     dof = np.maximum(problem.dof, 1.0)
     solved = state.status == 0
@@ -136,13 +137,13 @@ def _usual(problem: Problem, state: State) -> FloatArray:
     return np.asarray(np.maximum(_FAR_WORSE * good, 1.0 + 6.0 * np.sqrt(2.0 / dof)))
 
 
-def _score(problem: Problem, start: State, parameter: FloatArray) -> float:
+def _score(problem: Problem, start: Fits, parameter: FloatArray) -> float:
     trial = start.copy()
     problem.fit(trial, parameter, max_iteration=_MAX_ITERATION_TRIED)
     return _cost(problem, trial)
 
 
-def _cost(problem: Problem, state: State) -> float:
+def _cost(problem: Problem, state: Fits) -> float:
     """How badly mirrors fit, none able to outweigh the rest."""
     with np.errstate(over="ignore"):
         return float(np.log1p(np.minimum(state.chi2, 1e12) / np.maximum(problem.dof, 1.0)).sum())

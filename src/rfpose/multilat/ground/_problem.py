@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.multilat.ground import _kernels
-from rfpose.multilat.rigid.problem import MirrorProblem, start_clock
+from rfpose.multilat.equations import Mirrors
+from rfpose.multilat.reflection import Scene, direct_rays, shifts_at_points
+from rfpose.multilat.rigid.fits import FLOOR, Fits, Rule, begin, fit, predict
+from rfpose.multilat.rigid.problem import MirrorProblem
 
-__all__ = ["CalibrationSight", "Problem", "State", "build"]
+__all__ = ["CalibrationSight", "Problem", "build", "follow"]
 
 IntArray = npt.NDArray[np.int64]
 
-MAX_ITERATION = 30
-_FLOOR = 1e-13
+_RULE = Rule(max_iteration=30, floor=FLOOR, longest_turn=0.2, settled=1e-4)
 NO_TURN: FloatArray = np.zeros((1, 3))
 
 
@@ -57,68 +58,18 @@ class CalibrationSight:
         return cls(place_enu_m=as_float_array("calibration_enu_m", sight, ("calibration receiver", 3)))
 
 
-@dataclass(slots=True, kw_only=True)
-class State:
-    """Where each mirror stands: mirror is the first axis. Changed in place by fits.
+def follow(fits: Fits, step: FloatArray) -> None:
+    """Let poses and clocks follow a change of the coefficients, to first order."""
+    from scipy.spatial.transform import Rotation
 
-    ``cov`` (unknown, unknown) of pose and clocks is at given coefficients; ``follow`` is how pose and clocks move with
-    the coefficients, ``schur`` and ``rest`` the information and gradient a mirror leaves for them.
-    """
-
-    pivot: FloatArray
-    rot: FloatArray
-    clock: FloatArray
-    cov: FloatArray
-    follow: FloatArray
-    schur: FloatArray
-    rest: FloatArray
-    chi2: FloatArray
-    n_iteration: IntArray
-    status: IntArray
-
-    @classmethod
-    def begin(cls, pivot: FloatArray, rot: FloatArray, clock: FloatArray, status: IntArray, n_parameter: int) -> State:
-        """Nothing solved yet."""
-        n_mirror, n_class, n_receiver = clock.shape
-        return cls(
-            pivot=pivot.copy(),
-            rot=rot.copy(),
-            clock=clock.copy(),
-            cov=np.full((n_mirror, *2 * (6 + n_class * n_receiver,)), np.nan),
-            follow=np.zeros((n_mirror, 6 + n_class * n_receiver, n_parameter)),
-            schur=np.zeros((n_mirror, n_parameter, n_parameter)),
-            rest=np.zeros((n_mirror, n_parameter)),
-            chi2=np.full(n_mirror, np.inf),
-            n_iteration=np.zeros(n_mirror, np.int64),
-            status=status.copy(),
-        )
-
-    def take(self, rows: IntArray) -> State:
-        """Copy some mirrors."""
-        return State(**{f.name: getattr(self, f.name)[rows].copy() for f in fields(self)})
-
-    def copy(self) -> State:
-        """Copy all."""
-        return State(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
-
-    def put(self, rows: IntArray, other: State) -> None:
-        """Write mirrors back."""
-        for f in fields(self):
-            getattr(self, f.name)[rows] = getattr(other, f.name)
-
-    def move(self, step: FloatArray) -> None:
-        """Let poses and clocks follow a change of the coefficients, to first order."""
-        from scipy.spatial.transform import Rotation
-
-        change = self.follow @ step
-        self.pivot += change[:, :3]
-        turn = change[:, 3:6]
-        length = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = turn * np.minimum(1.0, 0.2 / np.maximum(length, 1e-300))
-        self.rot[:] = np.where(
-            np.isfinite(self.rot), Rotation.from_rotvec(np.nan_to_num(turn)).as_matrix() @ self.rot, np.nan
-        )
-        self.clock += change[:, 6:].reshape(self.clock.shape)
+    change = fits.follow @ step
+    fits.pivot[:] += change[:, :3]
+    turn = change[:, 3:6]
+    length = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn = turn * np.minimum(1.0, 0.2 / np.maximum(length, 1e-300))
+    rot = Rotation.from_rotvec(np.nan_to_num(turn)).as_matrix() @ fits.rot
+    fits.rot[:] = np.where(np.isfinite(fits.rot), rot, np.nan)
+    fits.clock[:] += change[:, 6:].reshape(fits.clock.shape)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,8 +87,8 @@ class Problem:
         Measurements and priors less a mirror's own unknowns.
     """
 
-    scene: _kernels.Scene
-    mirrors: _kernels.Mirrors
+    scene: Scene
+    mirrors: Mirrors
     calibration: CalibrationSight
     dof: FloatArray
 
@@ -165,17 +116,14 @@ class Problem:
 
     def take(self, rows: IntArray) -> Problem:
         """Select mirrors."""
-        m = self.mirrors
-        mirrors = m._replace(
-            **{name: getattr(m, name)[rows] for name in m._fields if name not in ("clock_class", "roll_info")}
-        )
+        mirrors = self.mirrors.take(rows)
         calibration = self.calibration
         if calibration.frame is not None:
             frame = calibration.frame[rows]
             calibration, mirrors = replace(calibration, frame=frame), mirrors._replace(frame=_rank(frame))
         return replace(self, mirrors=mirrors, calibration=calibration, dof=self.dof[rows])
 
-    def scene_at(self, parameter: FloatArray) -> _kernels.Scene:
+    def scene_at(self, parameter: FloatArray) -> Scene:
         """Return the scene with estimated coefficients put in, and with what the calibration carries of them.
 
         Carriers have none of it: what is common to a mirror's receivers is unknown there anyway.
@@ -189,99 +137,51 @@ class Problem:
             return scene
         n_transmitter, n_group, n_value = scene.common.shape[1:]
         seen = np.zeros((len(place), n_transmitter, n_group, 3 + n_value))
-        _kernels.shifts_at_points(len(place), scene, place, seen)
+        shifts_at_points(len(place), scene, place, seen)
         tones = np.flatnonzero(scene.tone_k)
         common = np.zeros((len(self.frames), n_transmitter, n_group, n_value))
         common[:, :, tones] = self.calibration.change_m(np.delete(seen, (1, 2, 3), axis=3)[:, :, tones], self.frames)
         return scene._replace(common=common)
 
+    def begin(self, pivot: FloatArray, rot: FloatArray, status: IntArray) -> Fits:
+        """Return mirrors from which to begin, with the clocks that fit them best."""
+        n_cov = 6 + self.mirrors.prior.clock[0].size
+        return begin(self.mirrors, pivot, rot, status, n_cov=n_cov, n_parameter=self.n_parameter)
+
     def fit(
         self,
-        state: State,
+        fits: Fits,
         parameter: FloatArray,
         *,
         turn: FloatArray = NO_TURN,
         enough: FloatArray | float = np.inf,
-        max_iteration: int = MAX_ITERATION,
+        max_iteration: int = _RULE.max_iteration,
     ) -> None:
-        """Solve every mirror at given coefficients from where ``state`` stands, or from there turned by ``turn``.
+        """`rfpose.multilat.rigid.fits.fit` of every mirror at given coefficients."""
+        rule = _RULE._replace(max_iteration=max_iteration)
+        fit(self.scene_at(parameter), self.mirrors, rule, fits, turn=turn, enough=enough)
 
-        One that does not converge keeps pose and chi² of its last step.
-        """
-        n_mirror = len(state.chi2)
-        _kernels.fit_many(
-            n_mirror,
-            self.scene_at(parameter),
-            self.mirrors,
-            max_iteration,
-            _FLOOR,
-            turn,
-            np.array(np.broadcast_to(enough, (n_mirror,)), np.float64),
-            state.pivot,
-            state.rot,
-            state.clock,
-            state.cov,
-            state.follow,
-            state.schur,
-            state.rest,
-            state.chi2,
-            state.n_iteration,
-            state.status,
-        )
-
-    def predict(self, state: State, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def predict(self, fits: Fits, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
-        predicted = np.empty(self.mirrors.z.shape)
-        slope = np.empty((*predicted.shape, 6 + self.n_parameter))
-        scene = self.scene_at(parameter)
-        mirrors = self.mirrors
-        _kernels.predict_many(
-            len(state.pivot), scene, mirrors.frame, mirrors.receiver_mirror, state.pivot, state.rot, predicted, slope
-        )
-        return predicted, slope
+        return predict(self.scene_at(parameter), self.mirrors, fits)
 
     def direct(self) -> Problem:
         """Leave all reflections out."""
-        scene = self.scene
-        n_transmitter, n_group, _ = scene.common.shape[1:]
         return replace(
             self,
             calibration=CalibrationSight(place_enu_m=np.empty((0, 3))),
             mirrors=self.mirrors._replace(frame=np.zeros_like(self.mirrors.frame)),
-            scene=scene._replace(
-                image=scene.image[:0],
-                normal=scene.normal[:0],
-                kind=scene.kind[:0],
-                permittivity=scene.permittivity[:0],
-                coefficient=scene.coefficient[:0],
-                column=scene.column[:0],
-                common=np.zeros((1, n_transmitter, n_group, 1)),
-            ),
+            scene=direct_rays(self.scene.transmitter, len(self.scene.tone_k)),
         )
 
 
-def build(
-    scene: _kernels.Scene, mirrors: MirrorProblem, *, calibration: CalibrationSight | npt.ArrayLike | None
-) -> tuple[Problem, FloatArray]:
-    """Lay out mirrors with their integers resolved; also clocks (mirror, class, receiver) that fit where they begin."""
+def build(scene: Scene, mirrors: MirrorProblem, *, calibration: CalibrationSight | npt.ArrayLike | None) -> Problem:
+    """Lay out mirrors with their integers resolved."""
     calibration = CalibrationSight.checked(calibration)
-    equations = mirrors.equations
-    clock = start_clock(mirrors, mirrors.start_pivot_enu_m, mirrors.start_rot_enu_from_mirror)
-    arrays = _kernels.Mirrors(
-        receiver_mirror=np.ascontiguousarray(mirrors.receiver_mirror_m),
-        z=np.nan_to_num(mirrors.range_m),
-        weight=equations.weight,
-        bias_info=equations.bias_info,
-        clock_class=mirrors.clock_class,
-        pivot_prior=equations.pivot,
-        pivot_info=equations.pivot_info,
-        roll_info=equations.roll_info,
-        clock_own=equations.clock_own,
-        clock_tie=equations.clock_tie,
-        clock_prior=clock.copy(),
-        frame=np.zeros(len(clock), np.int64) if calibration.frame is None else _rank(calibration.frame),
-    )
-    return Problem(scene=scene, mirrors=arrays, calibration=calibration, dof=equations.dof), clock
+    arrays = mirrors.equations
+    if calibration.frame is not None:
+        arrays = arrays._replace(frame=_rank(calibration.frame))
+    return Problem(scene=scene, mirrors=arrays, calibration=calibration, dof=mirrors.dof)
 
 
 def _rank(frame: IntArray) -> IntArray:

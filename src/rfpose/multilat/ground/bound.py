@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.ground import _coefficients
-from rfpose.multilat.ground._problem import CalibrationSight, State, build
+from rfpose.multilat.ground._problem import CalibrationSight, build
 from rfpose.multilat.ground.model import SPEED_OF_LIGHT_MPS, Reflector, build_scene
 from rfpose.multilat.ground.solve import joint_covariance
 from rfpose.multilat.rigid.problem import MirrorProblem
@@ -61,14 +61,16 @@ def ground_bound(
     known = mirrors.knowledge
     if known.pivot_enu_m is not None:
         mirrors = replace(mirrors, knowledge=replace(known, pivot_enu_m=pivot))
-    problem, clock = build(scene, mirrors, calibration=calibration_enu_m)
+    problem = build(scene, mirrors, calibration=calibration_enu_m)
     # measurements exactly as predicted: the solver stops where it starts and hands on its information
-    clock[:] = 0.0
+    arrays = problem.mirrors
+    still = arrays._replace(prior=arrays.prior._replace(clock=np.zeros_like(arrays.prior.clock)))
+    problem = replace(problem, mirrors=still)
     truth = np.array([c for c, r in zip(coefficient, reflectors, strict=True) if r.estimated], np.complex128)
     parameter = np.stack([truth.real, truth.imag], axis=1).ravel()
-    state = State.begin(pivot, rot, clock, np.zeros(n_mirror, np.int64), problem.n_parameter)
+    state = problem.begin(pivot, rot, np.zeros(n_mirror, np.int64))
     predicted, _ = problem.predict(state, parameter)
-    problem = replace(problem, mirrors=problem.mirrors._replace(z=predicted, clock_prior=clock.copy()))
+    problem = replace(problem, mirrors=still._replace(z=predicted))
     state.status[~mirrors.has_start] = PoseStatus.TOO_FEW
     problem.fit(state, parameter)
     solved = state.status == 0

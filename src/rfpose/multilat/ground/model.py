@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.multilat.ground import _kernels
+from rfpose.multilat.reflection import Scene, shifts_at_points
 
 __all__ = ["LEVEL_GROUND", "Reflector", "Surface", "build_scene", "fresnel_coefficient", "heights_m", "range_shift_m"]
 
@@ -180,7 +180,7 @@ def range_shift_m(
         propagation_speed_mps=as_positive("propagation_speed_mps", propagation_speed_mps),
     )
     out = np.zeros((len(point), len(transmitter), len(scene.tone_k), 4))
-    _kernels.shifts_at_points(len(point), scene, point, out)
+    shifts_at_points(len(point), scene, point, out)
     return out[..., 0]
 
 
@@ -192,7 +192,7 @@ def build_scene(
     tone_hz: FloatArray,
     free_space: bool,
     propagation_speed_mps: float,
-) -> _kernels.Scene:
+) -> Scene:
     """Arrays for the kernels; arguments as in `range_shift_m`. Coefficients to be estimated start at zero.
 
     Raises
@@ -222,8 +222,8 @@ def build_scene(
             free += 2
         else:
             coefficient[p] = 1.0 if reflector.coefficient is None else reflector.coefficient
-    return _kernels.Scene(
-        transmitter=transmitter,
+    return Scene(
+        transmitter=np.array(transmitter),
         image=image,
         normal=np.array([geometry.unit(r.normal_enu) for r in reflectors]).reshape(-1, 3),
         carrier_k=2.0 * np.pi * carrier_rf_hz / propagation_speed_mps,

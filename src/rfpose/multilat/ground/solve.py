@@ -17,7 +17,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._coefficients import MAX_CONDITION
-from rfpose.multilat.ground._problem import NO_TURN, CalibrationSight, Problem, State, build
+from rfpose.multilat.ground._problem import NO_TURN, CalibrationSight, Problem, build
 from rfpose.multilat.ground.integers import resolve
 from rfpose.multilat.ground.model import (
     LEVEL_GROUND,
@@ -27,6 +27,7 @@ from rfpose.multilat.ground.model import (
     build_scene,
     heights_m,
 )
+from rfpose.multilat.rigid.fits import Fits
 from rfpose.multilat.rigid.pose import RigidPoses
 from rfpose.multilat.rigid.problem import MirrorProblem, Observation
 from rfpose.multilat.status import PoseStatus, has_start
@@ -83,7 +84,7 @@ class GroundSolution:
     probability: FloatArray
     status: IntArray
     problem: Problem
-    state: State
+    state: Fits
     parameter: FloatArray
 
 
@@ -147,7 +148,7 @@ def solve_with_ground(
         propagation_speed_mps=speed,
     )
 
-    def lay_out(ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> tuple[Problem, FloatArray]:
+    def lay_out(ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> Problem:
         count = len(ranges)
         used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :, :count].copy())
         begun = replace(
@@ -165,9 +166,9 @@ def solve_with_ground(
     for k in range(n_tone):
         resolved, risk[:, k], offset = resolve(observations[k], distance, float(start_sigma_m), known, offset)
         ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
-    problem, clock = lay_out(ranges, pivot, rot)
+    problem = lay_out(ranges, pivot, rot)
     status[(status == PoseStatus.OK) & (problem.dof < 0)] = PoseStatus.UNKNOWNS
-    start = State.begin(pivot, rot, clock, status, problem.n_parameter)
+    start = problem.begin(pivot, rot, status)
     probability_direct = _direct_probability(problem, start)
     turn = turns()
     parameter = _coefficients.find(problem, start, turn)
@@ -176,7 +177,7 @@ def solve_with_ground(
     _coefficients.retry(problem, start, state, parameter, turn)
     parameter = _coefficients.refine(problem, state, parameter)
     if n_tone < len(observations):
-        finest, _ = lay_out([o.range_m for o in observations], state.pivot, state.rot)
+        finest = lay_out([o.range_m for o in observations], state.pivot, state.rot)
         predicted, slope = finest.predict(state, parameter)
         cov = joint_covariance(state, _coefficient_cov(problem, state))
         pose_and_coefficients = [*range(6), *range(state.cov.shape[1], cov.shape[1])]
@@ -187,8 +188,8 @@ def solve_with_ground(
             resolved, risk[:, k], _ = resolve(observations[k], predicted[:, k], (slope[:, k], cov), known)
             risk[~sound, k] = 1.0
             ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
-        problem, clock = lay_out(ranges, state.pivot, state.rot)
-        state = State.begin(state.pivot, state.rot, clock, state.status, problem.n_parameter)
+        problem = lay_out(ranges, state.pivot, state.rot)
+        state = problem.begin(state.pivot, state.rot, state.status)
         problem.fit(state, parameter)
         parameter = _coefficients.refine(problem, state, parameter)
     return _solution(
@@ -224,10 +225,10 @@ def turns() -> FloatArray:
     return np.concatenate([NO_TURN, _TURN_RAD * cube[inside][np.argsort(length[inside])]])
 
 
-def _direct_probability(problem: Problem, start: State) -> FloatArray:
+def _direct_probability(problem: Problem, start: Fits) -> FloatArray:
     """(mirror,) probability of the residuals with the direct ray alone."""
     direct = problem.direct()
-    state = State.begin(start.pivot, start.rot, start.clock, start.status, 0)
+    state = direct.begin(start.pivot, start.rot, start.status)
     direct.fit(state, np.zeros(0), max_iteration=_MAX_ITERATION_DIRECT)
     return _probability(state.chi2, problem.dof, has_start(state.status))
 
@@ -239,7 +240,7 @@ def _probability(chi2: FloatArray, dof: FloatArray, solved: BoolArray) -> FloatA
     return np.asarray(np.where(known, chdtrc(np.maximum(dof, 1e-9), np.where(known, chi2, 0.0)), np.nan))
 
 
-def _coefficient_cov(problem: Problem, state: State) -> FloatArray:
+def _coefficient_cov(problem: Problem, state: Fits) -> FloatArray:
     """Covariance of the coefficients; NaN where the mirrors do not determine them."""
     information = _coefficients.information(state, _coefficients.trusted(problem, state))
     if information.size and not (np.any(information) and np.linalg.cond(information) < MAX_CONDITION):
@@ -247,7 +248,7 @@ def _coefficient_cov(problem: Problem, state: State) -> FloatArray:
     return np.asarray(np.linalg.inv(information))
 
 
-def joint_covariance(state: State, coefficient_cov: FloatArray) -> FloatArray:
+def joint_covariance(state: Fits, coefficient_cov: FloatArray) -> FloatArray:
     """(mirror, unknown + parameter, unknown + parameter) of pose, clocks and coefficients."""
     n_mirror, n_own, n_parameter = state.follow.shape
     follow = state.follow
@@ -261,7 +262,7 @@ def joint_covariance(state: State, coefficient_cov: FloatArray) -> FloatArray:
 
 def _solution(
     problem: Problem,
-    state: State,
+    state: Fits,
     parameter: FloatArray,
     places: FloatArray,
     reflectors: Sequence[Reflector],

@@ -10,11 +10,37 @@ fault lowers chi² by eᵀ R⁻¹ e.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
-from rfpose.multilat.rigid._kernels import factor, ranges_and_slopes, solve_factored
+from rfpose.multilat.equations._kernels import add_prior, covariance, factor, normal_equations
+from rfpose.multilat.reflection._kernels import work_for
+from rfpose.multilat.rigid._kernels import predict
+
+
+class Solved(NamedTuple):
+    """What the data alone say of each mirror's unknowns at its pose, and the covariance with all that is known."""
+
+    ok: Any
+    data_info: Any
+    data_gradient: Any
+    cov: Any
+
+
+class Tests(NamedTuple):
+    """Statistics of hypotheses; as in `rfpose.multilat.integrity.hypotheses.Verdict`."""
+
+    stat: Any
+    dof: Any
+    hidden: Any
+    shift: Any
+    spread: Any
+    common: Any
+    common_dof: Any
+    link: Any
+    link_dof: Any
 
 
 @kernel
@@ -137,44 +163,34 @@ def _in_subspace(redundancy, left, basis, floor):
 
 
 @kernel
-def _judge_one(
-    transmitter, places, z, weight, bias_info, clock_class, prior_info, pivot, rot, clock, floor,
-    data_info, data_gradient, cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof,
-):  # fmt: skip
-    """Statistics of all transmitters of one mirror; False where the pose is not determined."""
+def _judge_one(scene, mirrors, m, floor, pivot, rot, clock, data_info, data_gradient, cov, to):
+    """Statistics of all transmitters of mirror ``m``; False where the pose is not determined."""
+    z, weight, bias_info, clock_class = mirrors.z[m], mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class
+    stat, dof, hidden, shift, spread = to.stat[m], to.dof[m], to.hidden[m], to.shift[m], to.spread[m]
+    common, common_dof, link, link_dof = to.common[m], to.common_dof[m], to.link[m], to.link_dof[m]
     n_group, n_receiver, n_transmitter = z.shape
-    n = prior_info.shape[0]
+    n = data_gradient.shape[0]
     k = n_group * n_receiver
-    distance = np.empty((n_receiver, n_transmitter))
-    slope = np.empty((n_receiver, n_transmitter, 6))
-    ranges_and_slopes(transmitter, places, pivot, rot, distance, slope)
+    predicted = np.empty((1, n_receiver, n_transmitter))
+    slope = np.empty((1, n_receiver, n_transmitter, 6))
+    predict(scene, scene.common[0], work_for(0), mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
+    normal_equations(z, weight, bias_info, clock_class, predicted, slope, clock, data_info, data_gradient)
+    for a in range(n):
+        for b in range(a):
+            data_info[b, a] = data_info[a, b]
+    lower = data_info.copy()
+    add_prior(mirrors.prior, m, rot, lower, 0, 6)
+    if not factor(lower, 1e-13):
+        return False
+    covariance(lower, cov)
     rows = np.empty((n_transmitter, k, n))
     left = np.empty((n_transmitter, k))
     along = np.empty((n_transmitter, n_group, n_receiver))
     shrink = np.empty((n_transmitter, n_group))
-    data_info[:] = 0.0
-    data_gradient[:] = 0.0
     for i in range(n_transmitter):
         dof[i] = whiten(
-            z, weight, bias_info, clock_class, distance, slope, clock, i, rows[i], left[i], along[i], shrink[i]
+            z, weight, bias_info, clock_class, predicted[0], slope[0], clock, i, rows[i], left[i], along[i], shrink[i]
         )
-        for p in range(k):
-            for a in range(n):
-                v = rows[i, p, a]
-                if v != 0.0:
-                    data_gradient[a] += v * left[i, p]
-                    for b in range(n):
-                        data_info[a, b] += v * rows[i, p, b]
-    lower = data_info + prior_info
-    if not factor(lower, 1e-13):
-        return False
-    column = np.empty(n)
-    for a in range(n):
-        column[:] = 0.0
-        column[a] = 1.0
-        solve_factored(lower, column)
-        for b in range(n):
-            cov[a, b] = column[b]
     # the normal's two tilts: rotation about the mirror's x and y axes
     tilt_variance = 0.0
     turned = np.zeros((2, n))
@@ -231,16 +247,10 @@ def _judge_one(
 
 
 @kernel_rows
-def judge_many(
-    begin,
-    end,
-    transmitter, places, z, weight, bias_info, clock_class, prior_info, pivot, rot, clock, floor,
-    data_info, data_gradient, cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,
-):  # fmt: skip
-    """`_judge_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
+def judge_many(begin, end, scene, mirrors, floor, pivot, rot, clock, solved, tests):
+    """`_judge_one` for every mirror."""
     for m in range(begin, end):
-        ok[m] = _judge_one(
-            transmitter, places[m], z[m], weight[m], bias_info[m], clock_class, prior_info[m], pivot[m], rot[m],
-            clock[m], floor, data_info[m], data_gradient[m], cov[m], stat[m], dof[m], hidden[m], shift[m], spread[m],
-            common[m], common_dof[m], link[m], link_dof[m],
+        solved.ok[m] = _judge_one(
+            scene, mirrors, m, floor, pivot[m], rot[m], clock[m], solved.data_info[m], solved.data_gradient[m],
+            solved.cov[m], tests,
         )  # fmt: skip

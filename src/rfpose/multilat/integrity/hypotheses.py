@@ -7,19 +7,18 @@ equations; without a fault it is chi²-distributed with as many degrees of freed
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.integrity import _kernels
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, RigidPoses
-from rfpose.multilat.rigid.problem import degrees_of_freedom
+from rfpose.multilat.reflection import direct_rays
+from rfpose.multilat.rigid import MirrorProblem, RigidPoses
+from rfpose.multilat.rigid.problem import PRIORS
 
 __all__ = [
-    "PRIORS",
-    "Problem",
     "Verdict",
     "judge",
     "largest_eigenvalue",
@@ -34,102 +33,10 @@ __all__ = [
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-PRIORS = ("pivot", "mount", "clocks")
-"""What a mirror may rest on besides its phases, in the order of the hypotheses after the transmitters."""
-
 _FLOOR = 1e-8
 """Redundancy below which a fault counts as invisible."""
 _TIE_FLOOR = 1e-6
-"""Smallest variance of a receiver's delay, in units of the best observation's: stiff enough to be a shared clock."""
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Checked arrays of all mirrors, observations left out as weight zero.
-
-    Attributes
-    ----------
-    transmitter : (transmitter, xyz)
-    places : (mirror, receiver, xyz)
-    z, weight : (mirror, group, receiver, transmitter)
-        Ranges [m] and 1/σ².
-    bias_info : (mirror, group, transmitter)
-    classes : (group,)
-    known
-        Priors that all mirrors have, unless ``dropped``.
-    dropped : (mirror, prior)
-        Which of `PRIORS` is not used.
-    """
-
-    transmitter: FloatArray
-    places: FloatArray
-    z: FloatArray
-    weight: FloatArray
-    bias_info: FloatArray
-    classes: IntArray
-    known: Knowledge
-    dropped: BoolArray
-
-    @classmethod
-    def of(cls, mirrors: MirrorProblem) -> Problem:
-        """Return what is tested of mirrors, nothing left out yet."""
-        equations = mirrors.equations
-        return cls(
-            transmitter=mirrors.transmitter_enu_m,
-            places=mirrors.receiver_mirror_m,
-            z=np.where(equations.weight > 0.0, mirrors.range_m, 0.0),
-            weight=equations.weight.copy(),
-            bias_info=equations.bias_info,
-            classes=mirrors.clock_class,
-            known=mirrors.knowledge,
-            dropped=np.zeros((len(mirrors.range_m), len(PRIORS)), np.bool_),
-        )
-
-    @property
-    def has_prior(self) -> BoolArray:
-        """(mirror, prior) which of `PRIORS` is used."""
-        known = self.known
-        given = np.array([known.has_pivot, known.two_axis, np.isfinite(known.clock_sigma_m)])
-        return np.asarray(given & ~self.dropped)
-
-    def rows(self, index: npt.NDArray[np.int64]) -> Problem:
-        """Only some mirrors (the pivots of ``known`` stay those of all)."""
-        return Problem(
-            self.transmitter,
-            self.places[index],
-            self.z[index],
-            self.weight[index],
-            self.bias_info[index],
-            self.classes,
-            self.known,
-            self.dropped[index],
-        )
-
-    def prior_info(self, rot: FloatArray) -> FloatArray:
-        """(mirror, unknown, unknown) information of the priors, and of what only fixes an arbitrary common clock."""
-        n_mirror, _, n_receiver, _ = self.z.shape
-        n_class = int(self.classes.max()) + 1
-        has = self.has_prior
-        info = np.zeros((n_mirror, 6 + n_class * n_receiver, 6 + n_class * n_receiver))
-        info[:, range(3), range(3)] += (has[:, 0] / self.known.pivot_sigma_m**2)[:, None]
-        turn = np.stack([rot[:, 1, 0], -rot[:, 0, 0]], axis=-1) / self.known.roll_sigma_rad
-        info[:, 3:5, 3:5] += has[:, 1, None, None] * turn[:, :, None] * turn[:, None, :]
-        apart = np.eye(n_receiver) - 1.0 / n_receiver
-        for k in range(n_class):
-            clocks = slice(6 + k * n_receiver, 6 + (k + 1) * n_receiver)
-            largest = np.maximum(self.weight[:, self.classes == k].max(axis=(1, 2, 3)), 1e-300)
-            if has[:, 2].any():
-                tie = has[:, 2] / np.maximum(self.known.clock_sigma_m**2, _TIE_FLOOR / largest)
-                info[:, clocks, clocks] += tie[:, None, None] * apart
-            calibrated = np.any(self.bias_info[:, self.classes == k] > 0.0, axis=(1, 2))
-            info[:, clocks.start, clocks.start] += np.where(calibrated, 0.0, largest)
-        return info
-
-    def dof(self) -> IntArray:
-        """(mirror,) observations and priors less unknowns."""
-        has = self.has_prior
-        n = degrees_of_freedom(self.weight, self.bias_info, self.classes, tied=has[:, 2], n_prior=has[:, :2] @ [3, 1])
-        return n.astype(np.int64)
+"""As `rfpose.multilat.rigid.problem.STIFFEST_TIE`, so that freeing a tie stands out of its rounding."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,52 +75,56 @@ class Verdict:
     link: FloatArray
     link_dof: IntArray
 
+    def take(self, rows: IntArray) -> Verdict:
+        """Select mirrors."""
+        return Verdict(**{f.name: getattr(self, f.name)[rows] for f in fields(Verdict)})
 
-def judge(problem: Problem, poses: RigidPoses) -> Verdict:
+
+def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
     """Test every hypothesis at the least-squares poses."""
-    n_mirror, _, n_receiver, n_transmitter = problem.z.shape
-    n_hypothesis = n_transmitter + len(PRIORS)
+    mirrors = problem.weighed(_TIE_FLOOR)
+    n_mirror, n_group, n_receiver, n_transmitter = mirrors.z.shape
+    n_hypothesis, n = n_transmitter + len(PRIORS), 6 + problem.n_class * n_receiver
+    solved = _kernels.Solved(
+        ok=np.zeros(n_mirror, np.bool_),
+        data_info=np.zeros((n_mirror, n, n)),
+        data_gradient=np.zeros((n_mirror, n)),
+        cov=np.zeros((n_mirror, n, n)),
+    )
+    tests = _kernels.Tests(
+        stat=np.zeros((n_mirror, n_hypothesis)),
+        dof=np.zeros((n_mirror, n_hypothesis), np.int64),
+        hidden=np.zeros((n_mirror, n_hypothesis), np.bool_),
+        shift=np.zeros((n_mirror, n_hypothesis, 2)),
+        spread=np.zeros((n_mirror, n_hypothesis, 2, 2)),
+        common=np.zeros((n_mirror, n_transmitter)),
+        common_dof=np.zeros((n_mirror, n_transmitter), np.int64),
+        link=np.zeros((n_mirror, n_receiver, n_transmitter)),
+        link_dof=np.zeros((n_mirror, n_receiver, n_transmitter), np.int64),
+    )
     rot = np.ascontiguousarray(poses.rot_enu_from_mirror)
-    prior_info = problem.prior_info(rot)
-    n = prior_info.shape[1]
-    data_info, cov = np.zeros((2, n_mirror, n, n))
-    gradient = np.zeros((n_mirror, n))
-    stat = np.zeros((n_mirror, n_hypothesis))
-    dof = np.zeros((n_mirror, n_hypothesis), np.int64)
-    hidden = np.zeros((n_mirror, n_hypothesis), np.bool_)
-    shift = np.zeros((n_mirror, n_hypothesis, 2))
-    spread = np.zeros((n_mirror, n_hypothesis, 2, 2))
-    common, common_dof = np.zeros((n_mirror, n_transmitter)), np.zeros((n_mirror, n_transmitter), np.int64)
-    link = np.zeros((n_mirror, n_receiver, n_transmitter))
-    link_dof = np.zeros((n_mirror, n_receiver, n_transmitter), np.int64)
-    ok = np.zeros(n_mirror, np.bool_)
-    _kernels.judge_many(
-        n_mirror,
-        problem.transmitter, problem.places, problem.z, problem.weight, problem.bias_info, problem.classes, prior_info,
-        np.ascontiguousarray(poses.pivot_enu_m), rot, np.ascontiguousarray(poses.clock_m), _FLOOR, data_info, gradient,
-        cov, stat, dof, hidden, shift, spread, common, common_dof, link, link_dof, ok,
-    )  # fmt: skip
+    scene = direct_rays(problem.transmitter_enu_m, n_group)
+    pivot, clock = np.ascontiguousarray(poses.pivot_enu_m), np.ascontiguousarray(poses.clock_m)
+    _kernels.judge_many(n_mirror, scene, mirrors, _FLOOR, pivot, rot, clock, solved, tests)
     axes = rot[:, :, :2]
-    cov_tilt = np.einsum("mac,mab,mbd->mcd", axes, cov[:, 3:6, 3:6], axes)
+    cov_tilt = np.einsum("mac,mab,mbd->mcd", axes, solved.cov[:, 3:6, 3:6], axes)
     for k, (used, fault) in enumerate(zip(problem.has_prior.T, _prior_faults(problem, rot), strict=True)):
-        rows = np.flatnonzero(used & ok)
+        rows = np.flatnonzero(used & solved.ok)
         if rows.size:
-            h = n_transmitter + k
-            stat[rows, h], dof[rows, h], hidden[rows, h], shift[rows, h], spread[rows, h] = _free_prior(
-                data_info[rows], gradient[rows], cov[rows], axes[rows], cov_tilt[rows], fault[rows]
-            )
-    for array in (stat, dof, hidden, shift, spread, common, common_dof, link, link_dof):
-        array[~ok] = 0
+            _free_prior(solved, tests, rows, n_transmitter + k, axes[rows], cov_tilt[rows], fault[rows])
+    for array in tests:
+        array[~solved.ok] = 0
     return Verdict(
-        ok=ok, stat=stat, dof=dof, hidden=hidden, shift_rad=shift, spread_rad2=spread, cov_rad2=cov_tilt,
-        common=common, common_dof=common_dof, link=link, link_dof=link_dof,
+        ok=solved.ok, stat=tests.stat, dof=tests.dof, hidden=tests.hidden, shift_rad=tests.shift,
+        spread_rad2=tests.spread, cov_rad2=cov_tilt, common=tests.common, common_dof=tests.common_dof,
+        link=tests.link, link_dof=tests.link_dof,
     )  # fmt: skip
 
 
-def _prior_faults(problem: Problem, rot: FloatArray) -> list[FloatArray]:
+def _prior_faults(problem: MirrorProblem, rot: FloatArray) -> list[FloatArray]:
     """Unknowns (mirror, unknown, fault) that each of `PRIORS` would leave free."""
-    n_mirror, _, n_receiver, _ = problem.z.shape
-    n_class = int(problem.classes.max()) + 1
+    n_mirror, _, n_receiver, _ = problem.range_m.shape
+    n_class = problem.n_class
     eye = np.eye(6 + n_class * n_receiver)
     mount = np.zeros((n_mirror, len(eye), 1))
     mount[:, 3, 0], mount[:, 4, 0] = rot[:, 1, 0], -rot[:, 0, 0]
@@ -227,32 +138,29 @@ def _prior_faults(problem: Problem, rot: FloatArray) -> list[FloatArray]:
 
 
 def _free_prior(
-    data_info: FloatArray,
-    gradient: FloatArray,
-    cov: FloatArray,
+    solved: _kernels.Solved,
+    tests: _kernels.Tests,
+    rows: IntArray,
+    h: int,
     axes: FloatArray,
     cov_tilt: FloatArray,
     fault: FloatArray,
-) -> tuple[FloatArray, IntArray, BoolArray, FloatArray, FloatArray]:
-    """Drop of chi² when the unknowns ``fault`` are freed of their prior, for each mirror."""
-    through = data_info @ fault
-    answer = cov @ through
+) -> None:
+    """Test what freeing the unknowns ``fault`` of their prior does to each of ``rows``."""
+    through = solved.data_info[rows] @ fault
+    answer = solved.cov[rows] @ through
     matrix = np.swapaxes(fault, 1, 2) @ through - np.swapaxes(through, 1, 2) @ answer
-    right = np.einsum("mnf,mn->mf", fault, gradient)
+    right = np.einsum("mnf,mn->mf", fault, solved.data_gradient[rows])
     tilt = np.swapaxes(axes, 1, 2) @ (answer - fault)[:, 3:6]
     # each unknown in units of what the data alone would say of it
     unit = np.sqrt(np.maximum(np.einsum("mnf,mnf->mf", fault, through), 1e-300))
     matrix = matrix / (unit[:, :, None] * unit[:, None, :])
     right, tilt = right / unit, tilt / unit[:, None, :]
     blind = 1e-5 * np.sqrt(np.trace(cov_tilt, axis1=1, axis2=2))
-    n = len(fault)
-    stat, dof, hidden = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.bool_)
-    shift, spread = np.zeros((n, 2)), np.zeros((n, 2, 2))
-    for m in range(n):
-        stat[m], dof[m], hidden[m] = _kernels.explain(
-            matrix[m], right[m], tilt[m], _FLOOR, blind[m], shift[m], spread[m]
+    for k, m in enumerate(rows):
+        tests.stat[m, h], tests.dof[m, h], tests.hidden[m, h] = _kernels.explain(
+            matrix[k], right[k], tilt[k], _FLOOR, blind[k], tests.shift[m, h], tests.spread[m, h]
         )
-    return stat, dof, hidden, shift, spread
 
 
 def log_probability(stat: FloatArray, dof: IntArray) -> FloatArray:

@@ -1,54 +1,89 @@
-"""Normal equations of one rigid mirror, and Gauss-Newton over many.
+"""Gauss-Newton over many rigid mirrors, by direct rays or by these and reflected ones.
 
-Unknowns of one mirror with R receivers: [pivot 3, rotation 3, clock R, carrier clock R]. Observation group g (a
-tone, or the carrier), receiver r, transmitter i:
-
-    z = |pivot + rot m_r − T_i| + clock_{class(g), r} + b_gi + noise,   b_gi ~ N(0, 1/bias_info_gi)
-
-The transmitter's own error b is eliminated: a weighted mean over receivers comes off, all of it without calibration
-(bias_info = 0), none of it with a perfect one (infinite).
+Each mirror is solved at given coefficients of what reflects; what it says about them, its own unknowns eliminated, is
+left over as a Schur complement. Without planes that is the direct ray alone.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
+from rfpose.multilat.equations._kernels import (
+    Float64,
+    Int64,
+    add_prior,
+    covariance,
+    factor,
+    normal_equations,
+    pull_to_prior,
+    rotate,
+    solve_factored,
+)
+from rfpose.multilat.reflection._kernels import shift_at, work_for
 from rfpose.multilat.status import PoseStatus
 
 SOLVED, OPEN, STUCK = int(PoseStatus.OK), int(PoseStatus.UNDETERMINED), int(PoseStatus.NOT_CONVERGED)
 
 
-@kernel
-def rotate(theta, rot, out):
-    """Left-multiply by the rotation vector ``theta``: out = exp([theta]×) rot (Rodrigues)."""
-    angle2 = theta[0] * theta[0] + theta[1] * theta[1] + theta[2] * theta[2]
-    angle = math.sqrt(angle2)
-    if angle > 1e-8:
-        a = math.sin(angle) / angle
-        b = (1.0 - math.cos(angle)) / angle2
-    else:
-        a = 1.0 - angle2 / 6.0
-        b = 0.5 - angle2 / 24.0
-    for c in range(3):
-        x, y, z = rot[0, c], rot[1, c], rot[2, c]
-        cx = theta[1] * z - theta[2] * y
-        cy = theta[2] * x - theta[0] * z
-        cz = theta[0] * y - theta[1] * x
-        out[0, c] = x + a * cx + b * (theta[1] * cz - theta[2] * cy)
-        out[1, c] = y + a * cy + b * (theta[2] * cx - theta[0] * cz)
-        out[2, c] = z + a * cz + b * (theta[0] * cy - theta[1] * cx)
+class Rule(NamedTuple):
+    """When a fit ends: steps, smallest pivot that counts as observed, longest turn of a step [rad], what is no step."""
+
+    max_iteration: int
+    floor: float
+    longest_turn: float
+    settled: float
+
+
+class Fits(NamedTuple):
+    """Where each mirror stands, changed in place by fits; mirror is the first axis.
+
+    ``cov`` of the first unknowns (pose, then clocks) is at given coefficients; ``follow`` (mirror, unknown, parameter)
+    is how pose and clocks move with these, ``schur`` and ``rest`` the information and gradient left for them.
+    """
+
+    pivot: Float64
+    rot: Float64
+    clock: Float64
+    cov: Float64
+    follow: Float64
+    schur: Float64
+    rest: Float64
+    chi2: Float64
+    n_iteration: Int64
+    status: Int64
+
+    def take(self, rows: Int64) -> Fits:
+        """Copy some mirrors."""
+        return Fits(**{name: array[rows] for name, array in self._asdict().items()})
+
+    def copy(self) -> Fits:
+        """Copy all."""
+        return Fits(**{name: array.copy() for name, array in self._asdict().items()})
+
+    def put(self, rows: Int64, other: Fits) -> None:
+        """Write mirrors back."""
+        for array, new in zip(self, other, strict=True):
+            array[rows] = new
 
 
 @kernel
-def ranges_and_slopes(transmitter, receiver_mirror, pivot, rot, distance, slope):
-    """Distances (receiver, transmitter) and their derivative by [pivot, rotation] (receiver, transmitter, 6)."""
+def _arm(rot, place):
+    return (
+        rot[0, 0] * place[0] + rot[0, 1] * place[1] + rot[0, 2] * place[2],
+        rot[1, 0] * place[0] + rot[1, 1] * place[1] + rot[1, 2] * place[2],
+        rot[2, 0] * place[0] + rot[2, 1] * place[1] + rot[2, 2] * place[2],
+    )
+
+
+@kernel
+def _direct(transmitter, receiver_mirror, pivot, rot, distance, slope):
+    """Distances (receiver, transmitter) and their derivative by pivot and rotation (receiver, transmitter, ≥ 6)."""
     for r in range(receiver_mirror.shape[0]):
-        ax = rot[0, 0] * receiver_mirror[r, 0] + rot[0, 1] * receiver_mirror[r, 1] + rot[0, 2] * receiver_mirror[r, 2]
-        ay = rot[1, 0] * receiver_mirror[r, 0] + rot[1, 1] * receiver_mirror[r, 1] + rot[1, 2] * receiver_mirror[r, 2]
-        az = rot[2, 0] * receiver_mirror[r, 0] + rot[2, 1] * receiver_mirror[r, 1] + rot[2, 2] * receiver_mirror[r, 2]
+        ax, ay, az = _arm(rot, receiver_mirror[r])
         for i in range(transmitter.shape[0]):
             dx = pivot[0] + ax - transmitter[i, 0]
             dy = pivot[1] + ay - transmitter[i, 1]
@@ -66,341 +101,252 @@ def ranges_and_slopes(transmitter, receiver_mirror, pivot, rot, distance, slope)
 
 
 @kernel
-def normal_equations(z, weight, bias_info, clock_class, distance, slope, clock, info, gradient):
-    """Add all observations to ``info`` and ``gradient``; return their part of chi².
+def predict(scene, common, work, receiver_mirror, pivot, rot, predicted, slope):
+    """Ranges (group, receiver, transmitter) and derivatives (…, 6 + parameter), less what the calibration carries.
 
-    ``z``, ``weight`` (group, receiver, transmitter); ``bias_info`` (group, transmitter); ``clock`` (class, receiver).
-    Weight zero means not observed.
+    Without planes there is one group for all.
     """
-    n_group, n_receiver, n_transmitter = z.shape
-    n = info.shape[0]
-    row_sum = np.empty(n)
-    chi2 = 0.0
-    for g in range(n_group):
-        first_clock = 6 + clock_class[g] * n_receiver
-        for i in range(n_transmitter):
-            row_sum[:] = 0.0
-            total = 0.0
-            left_sum = 0.0
-            for r in range(n_receiver):
-                w = weight[g, r, i]
-                if w > 0.0:
-                    total += w
-                    left_sum += w * (z[g, r, i] - distance[r, i] - clock[clock_class[g], r])
-            if total == 0.0:
-                continue
-            # the transmitter's own error comes off first: what is left is small, and rounding stays small with it
-            scale = 1.0 / (total + bias_info[g, i])
-            bias = scale * left_sum
-            if bias != 0.0:
-                chi2 += bias * bias * bias_info[g, i]
-            for r in range(n_receiver):
-                w = weight[g, r, i]
-                if w == 0.0:
-                    continue
-                left = z[g, r, i] - distance[r, i] - clock[clock_class[g], r] - bias
-                c = first_clock + r
-                for a in range(6):
-                    wa = w * slope[r, i, a]
-                    for b in range(a + 1):
-                        info[a, b] += wa * slope[r, i, b]
-                    info[c, a] += wa
-                    gradient[a] += wa * left
-                    row_sum[a] += wa
-                info[c, c] += w
-                gradient[c] += w * left
-                row_sum[c] += w
-                chi2 += w * left * left
-            for a in range(n):
-                if row_sum[a] != 0.0:
-                    sa = scale * row_sum[a]
-                    for b in range(a + 1):
-                        info[a, b] -= sa * row_sum[b]
-    return chi2
+    _direct(scene.transmitter, receiver_mirror, pivot, rot, predicted[0], slope[0])
+    if scene.image.shape[0] == 0:
+        return
+    n_parameter = slope.shape[3] - 6
+    shift = np.zeros((predicted.shape[0], 4 + n_parameter))
+    for r in range(receiver_mirror.shape[0]):
+        ax, ay, az = _arm(rot, receiver_mirror[r])
+        for i in range(predicted.shape[2]):
+            shift_at(scene, work, pivot[0] + ax, pivot[1] + ay, pivot[2] + az, i, shift)
+            for g in range(predicted.shape[0] - 1, -1, -1):  # the direct ray stands in the first group
+                predicted[g, r, i] = predicted[0, r, i] + shift[g, 0] - common[i, g, 0]
+                sx, sy, sz = shift[g, 1], shift[g, 2], shift[g, 3]
+                slope[g, r, i, 0] = slope[0, r, i, 0] + sx
+                slope[g, r, i, 1] = slope[0, r, i, 1] + sy
+                slope[g, r, i, 2] = slope[0, r, i, 2] + sz
+                slope[g, r, i, 3] = slope[0, r, i, 3] + ay * sz - az * sy
+                slope[g, r, i, 4] = slope[0, r, i, 4] + az * sx - ax * sz
+                slope[g, r, i, 5] = slope[0, r, i, 5] + ax * sy - ay * sx
+                for c in range(n_parameter):
+                    slope[g, r, i, 6 + c] = shift[g, 4 + c] - common[i, g, 1 + c]
 
 
 @kernel
-def add_priors(
-    pivot, rot, clock, pivot_prior, pivot_info, roll_info, clock_own, clock_tie, clock_prior, info, gradient
-):
-    """Add what is known beforehand: pivot (3×3), horizontal x axis of the mount, clocks and their differences."""
-    chi2 = 0.0
-    for a in range(3):
-        left_a = pivot_prior[a] - pivot[a]
-        for b in range(3):
-            if b <= a:
-                info[a, b] += pivot_info[a, b]
-            left_b = pivot_prior[b] - pivot[b]
-            gradient[a] += pivot_info[a, b] * left_b
-            chi2 += left_a * pivot_info[a, b] * left_b
-    if roll_info > 0.0:
-        # the mirror's x axis stays horizontal: its z component turns with (theta × x)_z = theta_0 x_1 − theta_1 x_0
-        j0, j1, left = rot[1, 0], -rot[0, 0], -rot[2, 0]
-        info[3, 3] += roll_info * j0 * j0
-        info[4, 3] += roll_info * j0 * j1
-        info[4, 4] += roll_info * j1 * j1
-        gradient[3] += roll_info * j0 * left
-        gradient[4] += roll_info * j1 * left
-        chi2 += roll_info * left * left
-    n_class, n_receiver = clock.shape
-    for k in range(n_class):
-        first = 6 + k * n_receiver
-        for a in range(n_receiver):
-            left_a = clock_prior[k, a] - clock[k, a]
-            info[first + a, first + a] += clock_own[k, a]
-            gradient[first + a] += clock_own[k, a] * left_a
-            chi2 += clock_own[k, a] * left_a * left_a
-            for b in range(a):
-                # between two clocks: as a difference, so that a stiff tie does not drown in rounding
-                w = clock_tie[k, a, b]
-                apart = left_a - (clock_prior[k, b] - clock[k, b])
-                info[first + a, first + a] += w
-                info[first + b, first + b] += w
-                info[first + a, first + b] -= w
-                gradient[first + a] += w * apart
-                gradient[first + b] -= w * apart
-                chi2 += w * apart * apart
-    return chi2
-
-
-@kernel
-def factor(matrix, floor):
-    """Cholesky of the lower triangle in place, unknowns scaled to unit diagonal first; False where it is singular.
-
-    ``floor`` is the smallest pivot, relative to the diagonal, that still counts as observed.
-    """
-    n = matrix.shape[0]
-    for j in range(n):
-        diagonal = matrix[j, j]
-        d = diagonal
-        for k in range(j):
-            d -= matrix[j, k] * matrix[j, k]
-        if not d > floor * diagonal or not diagonal > 0.0:
-            return False
-        root = math.sqrt(d)
-        matrix[j, j] = root
-        for i in range(j + 1, n):
-            s = matrix[i, j]
-            for k in range(j):
-                s -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = s / root
-    return True
-
-
-@kernel
-def solve_factored(lower, x):
-    """Solve L Lᵀ x = b in place."""
-    n = lower.shape[0]
-    for i in range(n):
-        s = x[i]
-        for k in range(i):
-            s -= lower[i, k] * x[k]
-        x[i] = s / lower[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= lower[k, i] * x[k]
-        x[i] = s / lower[i, i]
-
-
-@kernel
-def pose_covariance(lower, out):
-    """Covariance (6, 6) of pivot and rotation, all other unknowns estimated."""
-    n = lower.shape[0]
-    x = np.empty(n)
-    for a in range(6):
-        x[:] = 0.0
-        x[a] = 1.0
+def _leave(lower, info, gradient, cov, follow, schur, rest):
+    """What a converged mirror hands on: covariance, how it follows the parameters, what it says about them."""
+    n_own, n_parameter = lower.shape[0], schur.shape[0]
+    covariance(lower, cov)
+    x = np.empty(n_own)
+    for c in range(n_parameter):
+        for a in range(n_own):
+            x[a] = info[n_own + c, a]
         solve_factored(lower, x)
-        for b in range(6):
-            out[a, b] = x[b]
+        rest[c] = gradient[n_own + c]
+        for a in range(n_own):
+            follow[a, c] = -x[a]
+            rest[c] -= x[a] * gradient[a]
+        for b in range(n_parameter):
+            s = info[n_own + max(b, c), n_own + min(b, c)]
+            for a in range(n_own):
+                s -= x[a] * info[n_own + b, a]
+            schur[b, c] = s
 
 
 @kernel
-def _solve_one(
-    transmitter,
-    receiver_mirror,
-    z,
-    weight,
-    bias_info,
-    clock_class,
-    pivot_prior,
-    pivot_info,
-    roll_info,
-    clock_own,
-    clock_tie,
-    clock_prior,
-    max_iteration,
-    floor,
-    pivot,
-    rot,
-    clock,
-    cov,
-):
-    """Gauss-Newton with step halving from ``pivot, rot, clock``, which it changes; (chi², iterations, status)."""
+def _copy(source, target):
+    """Element by element: an assignment of slices compiles to much more."""
+    from_flat, to_flat = source.ravel(), target.ravel()
+    for a in range(from_flat.shape[0]):
+        to_flat[a] = from_flat[a]
+
+
+@kernel
+def _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock):
+    """Pose and clocks a share of a step away from the old ones."""
     n_class, n_receiver = clock.shape
-    n_transmitter = transmitter.shape[0]
-    n = 6 + n_class * n_receiver
-    distance = np.empty((n_receiver, n_transmitter))
-    slope = np.empty((n_receiver, n_transmitter, 6))
+    for a in range(3):
+        pivot[a] = old_pivot[a] + share * step[a]
+    rotate(share * step[3:6], old_rot, rot)
+    for k in range(n_class):
+        for r in range(n_receiver):
+            clock[k, r] = old_clock[k, r] + share * step[6 + k * n_receiver + r]
+
+
+@kernel
+def _fit(scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest):
+    """Gauss-Newton with step halving of mirror ``m`` at given coefficients; (chi², iterations, status)."""
+    z, weight = mirrors.z[m], mirrors.weight[m]
+    common = scene.common[mirrors.frame[m]]
+    n_parameter = schur.shape[0]
+    n_own = 6 + clock.size
+    n = n_own + n_parameter
+    n_bent = z.shape[0] if scene.image.shape[0] > 0 else 1
+    work = work_for(scene.image.shape[0])
+    predicted = np.empty((n_bent, z.shape[1], z.shape[2]))
+    slope = np.empty((n_bent, z.shape[1], z.shape[2], 6 + n_parameter))
     info = np.empty((n, n))
-    step = np.empty(n)
+    lower = np.empty((n_own, n_own))
+    gradient = np.empty(n)
+    step = np.empty(n_own)
     old_pivot, old_rot, old_clock = pivot.copy(), rot.copy(), clock.copy()
     chi2_before = np.inf
-    shrink = 1.0
-    status = STUCK
+    share = 1.0
     chi2 = np.nan
     used = 0
-    for iteration in range(max_iteration):
+    for iteration in range(rule.max_iteration):
         used = iteration + 1
-        ranges_and_slopes(transmitter, receiver_mirror, pivot, rot, distance, slope)
-        info[:] = 0.0
-        gradient = np.zeros(n)
-        chi2 = normal_equations(z, weight, bias_info, clock_class, distance, slope, clock, info, gradient)
-        chi2 += add_priors(
-            pivot, rot, clock, pivot_prior, pivot_info, roll_info, clock_own, clock_tie, clock_prior, info, gradient
+        predict(scene, common, work, mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
+        chi2 = normal_equations(
+            z, weight, mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock, info, gradient
         )
+        add_prior(mirrors.prior, m, rot, info, 0, 6)
+        chi2 += pull_to_prior(mirrors.prior, m, pivot, rot, clock, gradient)
         if not math.isfinite(chi2):
-            return chi2, used, STUCK
-        if chi2 > chi2_before * (1.0 + 1e-9) + 1e-6 and shrink > 1e-3:
+            return np.inf, used, STUCK
+        if chi2 > chi2_before * (1.0 + 1e-9) + 1e-6 and share > 1e-3:
             # too long a step: halve it from where it began
-            shrink *= 0.5
-            for a in range(3):
-                pivot[a] = old_pivot[a] + shrink * step[a]
-            rotate(shrink * step[3:6], old_rot, rot)
-            for k in range(n_class):
-                for r in range(n_receiver):
-                    clock[k, r] = old_clock[k, r] + shrink * step[6 + k * n_receiver + r]
+            share *= 0.5
+            _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
             continue
-        if not factor(info, floor):
+        for a in range(n_own):
+            for b in range(a + 1):
+                lower[a, b] = info[a, b]
+        if not factor(lower, rule.floor):
             return chi2, used, OPEN
-        for a in range(n):
+        for a in range(n_own):
             step[a] = gradient[a]
-        solve_factored(info, step)
+        solve_factored(lower, step)
         decrement = 0.0
-        for a in range(n):
+        for a in range(n_own):
             decrement += step[a] * gradient[a]
-        shrink = 1.0
         turn = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-        if turn > 0.5:
-            shrink = 0.5 / turn
+        share = 1.0 if turn <= rule.longest_turn else rule.longest_turn / turn
         chi2_before = chi2
-        old_pivot[:] = pivot
-        old_rot[:] = rot
-        old_clock[:] = clock
+        _copy(pivot, old_pivot)
+        _copy(rot, old_rot)
+        _copy(clock, old_clock)
+        _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
+        if decrement < rule.settled and share == 1.0:
+            _leave(lower, info, gradient, cov, follow, schur, rest)
+            return chi2 - decrement, used, SOLVED
+    return min(chi2, chi2_before), used, STUCK
+
+
+@kernel
+def _fit_from_turns(scene, mirrors, m, rule, turn, enough, pivot, rot, clock, cov, follow, schur, rest):
+    """`_fit` from the pose turned by each of ``turn`` (start, 3) until chi² is below ``enough``; else the smallest.
+
+    Without any that converged: where the best of the others stopped.
+    """
+    from_pivot, from_rot, from_clock = pivot.copy(), rot.copy(), clock.copy()
+    pivot_try, rot_try, clock_try = pivot.copy(), rot.copy(), clock.copy()
+    cov_try, follow_try, schur_try, rest_try = cov.copy(), follow.copy(), schur.copy(), rest.copy()
+    about = np.empty(3)
+    best = np.inf
+    status = STUCK
+    total = 0
+    for s in range(turn.shape[0]):
+        _copy(from_pivot, pivot_try)
+        _copy(from_clock, clock_try)
         for a in range(3):
-            pivot[a] += shrink * step[a]
-        rotate(shrink * step[3:6], old_rot, rot)
-        for k in range(n_class):
-            for r in range(n_receiver):
-                clock[k, r] += shrink * step[6 + k * n_receiver + r]
-        # the step promises less than a thousandth of a sigma
-        if decrement < 1e-6 and shrink == 1.0:
-            status = SOLVED
-            chi2 -= decrement
-            pose_covariance(info, cov)
+            about[a] = from_rot[a, 0] * turn[s, 0] + from_rot[a, 1] * turn[s, 1] + from_rot[a, 2] * turn[s, 2]
+        rotate(about, from_rot, rot_try)
+        chi2, used, outcome = _fit(
+            scene, mirrors, m, rule, pivot_try, rot_try, clock_try, cov_try, follow_try, schur_try, rest_try
+        )
+        total += used
+        if outcome == OPEN and status != SOLVED and best == np.inf:
+            status = OPEN
+        # a solution beats every attempt that did not come to an end
+        first = outcome == SOLVED and status != SOLVED
+        if first or (chi2 < best and (outcome == SOLVED or (outcome == STUCK and status != SOLVED))):
+            best = chi2
+            status = outcome
+            _copy(pivot_try, pivot)
+            _copy(rot_try, rot)
+            _copy(clock_try, clock)
+            _copy(cov_try, cov)
+            _copy(follow_try, follow)
+            _copy(schur_try, schur)
+            _copy(rest_try, rest)
+        if status == SOLVED and best < enough:
             break
-    return chi2, used, status
+    return best, total, status
 
 
 @kernel_rows
-def solve_many(
-    begin,
-    end,
-    transmitter,
-    receiver_mirror,
-    z,
-    weight,
-    bias_info,
-    clock_class,
-    pivot_prior,
-    pivot_info,
-    roll_info,
-    clock_own,
-    clock_tie,
-    clock_prior,
-    max_iteration,
-    floor,
-    pivot,
-    rot,
-    clock,
-    cov,
-    chi2,
-    n_iteration,
-    status,
-):
-    """`_solve_one` for every mirror: first axis of all arrays but transmitter and clock_class."""
+def fit_many(begin, end, scene, mirrors, rule, turn, enough, to):
+    """Fit every mirror that has a start: from there, or from there turned; see `_fit_from_turns`."""
     for m in range(begin, end):
-        if status[m] != SOLVED:
+        if to.status[m] != SOLVED and to.status[m] != OPEN and to.status[m] != STUCK:
             continue
-        chi2[m], n_iteration[m], status[m] = _solve_one(
-            transmitter,
-            receiver_mirror[m],
-            z[m],
-            weight[m],
-            bias_info[m],
-            clock_class,
-            pivot_prior[m],
-            pivot_info[m],
-            roll_info,
-            clock_own[m],
-            clock_tie[m],
-            clock_prior[m],
-            max_iteration,
-            floor,
-            pivot[m],
-            rot[m],
-            clock[m],
-            cov[m],
-        )
+        pivot, rot, clock, cov = to.pivot[m], to.rot[m], to.clock[m], to.cov[m]
+        follow, schur, rest = to.follow[m], to.schur[m], to.rest[m]
+        if turn.shape[0] == 0:
+            to.chi2[m], to.n_iteration[m], to.status[m] = _fit(
+                scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest
+            )
+        else:
+            to.chi2[m], to.n_iteration[m], to.status[m] = _fit_from_turns(
+                scene, mirrors, m, rule, turn, enough[m], pivot, rot, clock, cov, follow, schur, rest
+            )
 
 
 @kernel_rows
-def covariance_many(
-    begin,
-    end,
-    transmitter,
-    receiver_mirror,
-    weight,
-    bias_info,
-    clock_class,
-    pivot_info,
-    roll_info,
-    clock_own,
-    clock_tie,
-    floor,
-    pivot,
-    rot,
-    cov,
-):
-    """Covariance (unknown, unknown) of all unknowns at the given poses; rows that are not determined stay as given."""
-    n_receiver = receiver_mirror.shape[1]
-    n_class = clock_own.shape[1]
-    n = 6 + n_class * n_receiver
+def clocks_many(begin, end, scene, mirrors, pivot, rot, clock):
+    """Set clocks (mirror, class, receiver) that fit poses, one a mirror and class: the mean of range less distance."""
+    n_group, n_receiver, n_transmitter = mirrors.z.shape[1:]
+    distance = np.empty((n_receiver, n_transmitter))
+    unused = np.empty((n_receiver, n_transmitter, 6))
     for m in range(begin, end):
-        distance = np.empty((n_receiver, transmitter.shape[0]))
-        slope = np.empty((n_receiver, transmitter.shape[0], 6))
-        info = np.zeros((n, n))
-        unused = np.zeros(n)
-        clock = np.zeros((n_class, n_receiver))
-        ranges_and_slopes(transmitter, receiver_mirror[m], pivot[m], rot[m], distance, slope)
-        normal_equations(weight[m], weight[m], bias_info[m], clock_class, distance, slope, clock, info, unused)
-        add_priors(
-            pivot[m],
-            rot[m],
-            clock,
-            pivot[m],
-            pivot_info[m],
-            roll_info,
-            clock_own[m],
-            clock_tie[m],
-            clock,
-            info,
-            unused,
-        )
+        _direct(scene.transmitter, mirrors.receiver_mirror[m], pivot[m], rot[m], distance, unused)
+        for k in range(clock.shape[1]):
+            total = 0.0
+            count = 0
+            for g in range(n_group):
+                if mirrors.clock_class[g] != k:
+                    continue
+                for r in range(n_receiver):
+                    for i in range(n_transmitter):
+                        if mirrors.weight[m, g, r, i] > 0.0:
+                            total += mirrors.z[m, g, r, i] - distance[r, i]
+                            count += 1
+            clock[m, k] = total / count if count > 0 and math.isfinite(total) else 0.0
+
+
+@kernel_rows
+def predict_many(begin, end, scene, mirrors, pivot, rot, predicted, slope):
+    """`predict` for every mirror."""
+    for m in range(begin, end):
+        work = work_for(scene.image.shape[0])
+        common = scene.common[mirrors.frame[m]]
+        predict(scene, common, work, mirrors.receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])
+
+
+@kernel_rows
+def equations_many(begin, end, mirrors, predicted, slope, pivot, rot, clock, info, gradient, chi2):
+    """Normal equations with priors of every mirror where ``predicted`` and ``slope`` stand."""
+    for m in range(begin, end):
+        chi2[m] = normal_equations(
+            mirrors.z[m], mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class, predicted[m], slope[m],
+            clock[m], info[m], gradient[m],
+        )  # fmt: skip
+        add_prior(mirrors.prior, m, rot[m], info[m], 0, 6)
+        chi2[m] += pull_to_prior(mirrors.prior, m, pivot[m], rot[m], clock[m], gradient[m])
+
+
+@kernel_rows
+def covariance_many(begin, end, scene, mirrors, floor, pivot, rot, clock, cov):
+    """Covariance (unknown, unknown) of all unknowns at the given poses; rows that are not determined stay as given."""
+    n_receiver, n_transmitter = mirrors.z.shape[2:]
+    n = cov.shape[1]
+    work = work_for(0)
+    for m in range(begin, end):
+        predicted = np.empty((1, n_receiver, n_transmitter))
+        slope = np.empty((1, n_receiver, n_transmitter, 6))
+        info, unused = np.empty((n, n)), np.empty(n)
+        predict(scene, scene.common[0], work, mirrors.receiver_mirror[m], pivot[m], rot[m], predicted, slope)
+        normal_equations(
+            mirrors.z[m], mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock[m],
+            info, unused,
+        )  # fmt: skip
+        add_prior(mirrors.prior, m, rot[m], info, 0, 6)
         if factor(info, floor):
-            for a in range(n):
-                column = np.zeros(n)
-                column[a] = 1.0
-                solve_factored(info, column)
-                cov[m, a] = column
+            covariance(info, cov[m])

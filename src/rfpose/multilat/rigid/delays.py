@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid import _kernels
+from rfpose.multilat.equations import rotate
 
 __all__ = ["LearnedDelays", "learn_delays"]
 
@@ -146,7 +146,7 @@ def learn_delays(
         pivot[f, use] += move[use, :3]
         for m in np.flatnonzero(use):
             turned = np.empty((3, 3))
-            _kernels.rotate(move[m, 3:], rot[f, m], turned)
+            rotate(move[m, 3:], rot[f, m], turned)
             rot[f, m] = turned
         out_cov[f, use] -= (gain @ with_pose.swapaxes(1, 2))[use]
         kalman = np.where(use[:, None, None], np.linalg.solve(total, predicted).swapaxes(1, 2), 0.0)

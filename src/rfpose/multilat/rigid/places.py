@@ -15,8 +15,9 @@ import numpy as np
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
+from rfpose.multilat.equations import rotate
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.problem import MirrorProblem, start_clock
+from rfpose.multilat.rigid.problem import MirrorProblem
 
 __all__ = ["ReceiverPlaces", "places_bound", "refine_places"]
 
@@ -119,7 +120,7 @@ def places_bound(problem: MirrorProblem, *, common_pivot: bool = True) -> Receiv
     """
     state = _State.begin(problem, common_pivot)
     distance, _ = state.ranges()
-    state.problem = replace(problem, range_m=np.where(np.isfinite(problem.range_m), distance[:, None], np.nan))
+    state.problem = replace(state.problem, range_m=np.where(np.isfinite(problem.range_m), distance[:, None], np.nan))
     state.clock[:] = 0.0
     return state.result(True)
 
@@ -129,6 +130,7 @@ class _State:
     """Places, poses and clocks as they are now."""
 
     problem: MirrorProblem
+    surveyed: bool
     common_pivot: bool
     places: FloatArray
     pivot: FloatArray
@@ -144,9 +146,20 @@ class _State:
         pivot, rot = problem.start_pivot_enu_m.copy(), problem.start_rot_enu_from_mirror.copy()
         if common_pivot:
             pivot[:] = pivot.mean(axis=0)
-        clock = start_clock(problem, pivot, rot)
-        places = problem.receiver_mirror_m[0].copy()
-        return cls(problem=problem, common_pivot=common_pivot, places=places, pivot=pivot, rot=rot, clock=clock)
+        # surveys of the pivot count once for all postures
+        dropped = problem.dropped.copy()
+        dropped[:, 0] = True
+        surveyed = bool(problem.has_prior[0, 0])
+        problem = replace(problem.started(pivot, rot), dropped=dropped)
+        return cls(
+            problem=problem,
+            surveyed=surveyed,
+            common_pivot=common_pivot,
+            places=problem.receiver_mirror_m[0].copy(),
+            pivot=pivot,
+            rot=rot,
+            clock=problem.equations.prior.clock.copy(),
+        )
 
     def ranges(self) -> tuple[FloatArray, FloatArray]:
         """Distances (posture, receiver, transmitter) and unit vectors from the transmitters."""
@@ -157,57 +170,21 @@ class _State:
 
     def equations(self) -> tuple[FloatArray, FloatArray, float]:
         """Return the normal equations of each posture: [pivot, rotation, clocks, places], and chi²."""
-        p = self.problem.equations
-        classes = self.problem.clock_class
-        n_f, n_g, n_r, n_t = p.weight.shape
-        n_clock = self.problem.n_class * n_r
-        n = 6 + n_clock + 3 * n_r
+        mirrors = self.problem.equations
+        n_f, _, n_r, n_t = mirrors.z.shape
+        n = 6 + self.clock[0].size + 3 * n_r
         distance, unit = self.ranges()
         arm = np.einsum("fab,rb->fra", self.rot, self.places)
-        jacobian = np.zeros((n_f, n_g, n_r, n_t, n))
-        jacobian[..., :3] = unit[:, None]
-        jacobian[..., 3:6] = np.cross(arm[:, :, None], unit)[:, None]
+        slope = np.zeros((n_f, 1, n_r, n_t, 6 + 3 * n_r))
+        slope[:, 0, ..., :3], slope[:, 0, ..., 3:6] = unit, np.cross(arm[:, :, None], unit)
         turned = np.einsum("frta,fab->frtb", unit, self.rot)
         for r in range(n_r):
-            for g in range(n_g):
-                jacobian[:, g, r, :, 6 + classes[g] * n_r + r] = 1.0
-            jacobian[:, :, r, :, 6 + n_clock + 3 * r : 9 + n_clock + 3 * r] = turned[:, None, r]
-        z = self.problem.range_m
-        left = np.where(p.weight > 0.0, z - distance[:, None] - self.clock[:, classes][..., None], 0.0)
-        # the transmitters' own errors: a weighted mean over receivers comes off
-        total = p.weight.sum(axis=2) + p.bias_info
-        scale = np.where(total > 0.0, 1.0 / np.where(total > 0.0, total, 1.0), 0.0)
-        sum_row = np.einsum("fgrt,fgrtn->fgtn", p.weight, jacobian)
-        bias = scale * np.einsum("fgrt,fgrt->fgt", p.weight, left)
-        weighted = p.weight[..., None] * jacobian
-        info = np.einsum("fgrtn,fgrtm->fnm", weighted, jacobian, optimize=True)
-        info -= np.einsum("fgtn,fgt,fgtm->fnm", sum_row, scale, sum_row, optimize=True)
-        free = left - bias[:, :, None]
-        gradient = np.einsum("fgrtn,fgrt->fn", weighted, free)
-        with np.errstate(invalid="ignore"):
-            chi2 = float(np.sum(p.weight * free**2) + np.nansum(np.where(bias == 0.0, 0.0, p.bias_info) * bias**2))
-        self._add_priors(info, gradient)
-        return info, gradient, chi2
-
-    def _add_priors(self, info: FloatArray, gradient: FloatArray) -> None:
-        p, n_r = self.problem.equations, len(self.places)
-        for k in range(self.problem.n_class):
-            for a in range(n_r):
-                i = 6 + k * n_r + a
-                # a clock that is held stays where it is: no gradient
-                info[:, i, i] += p.clock_own[:, k, a]
-                for b in range(a):
-                    j, w = 6 + k * n_r + b, p.clock_tie[:, k, a, b]
-                    apart = self.clock[:, k, b] - self.clock[:, k, a]
-                    info[:, i, i] += w
-                    info[:, j, j] += w
-                    info[:, i, j] -= w
-                    info[:, j, i] -= w
-                    gradient[:, i] += w * apart
-                    gradient[:, j] -= w * apart
-        slope = np.stack([self.rot[:, 1, 0], -self.rot[:, 0, 0]], axis=1)
-        info[:, 3:5, 3:5] += p.roll_info * slope[:, :, None] * slope[:, None]
-        gradient[:, 3:5] += p.roll_info * slope * -self.rot[:, 2, :1]
+            slope[:, 0, r, :, 6 + 3 * r : 9 + 3 * r] = turned[:, r]
+        info, gradient, chi2 = np.empty((n_f, n, n)), np.empty((n_f, n)), np.empty(n_f)
+        _kernels.equations_many(
+            n_f, mirrors, distance[:, None], slope, self.pivot, self.rot, self.clock, info, gradient, chi2
+        )
+        return info + np.swapaxes(np.tril(info, -1), 1, 2), gradient, float(chi2.sum())
 
     def reduced(self) -> tuple[FloatArray, FloatArray, list[FloatArray], float]:
         """Information and gradient of [places, common pivot], all else eliminated; and what leads back."""
@@ -224,10 +201,12 @@ class _State:
         s = (info[:, shared[:, None], shared] - a_os.swapaxes(1, 2) @ back).sum(axis=0)
         g = (gradient[:, shared] - np.einsum("fos,fo->fs", a_os, rest)).sum(axis=0)
         if self.common_pivot:
-            prior, away = self.problem.equations.pivot_info[0], self.problem.equations.pivot[0] - self.pivot[0]
-            s[n_place:, n_place:] += prior
-            g[n_place:] += prior @ away
-            chi2 += float(away @ prior @ away)
+            known = self.problem.knowledge
+            if self.surveyed and known.pivot_enu_m is not None:
+                weight, away = known.pivot_sigma_m**-2, known.pivot_enu_m[0] - self.pivot[0]
+                s[n_place:, n_place:] += weight * np.eye(3)
+                g[n_place:] += weight * away
+                chi2 += float(weight * away @ away)
         return s, g, [back, rest, own, shared], chi2
 
     def step(self) -> float:
@@ -242,7 +221,7 @@ class _State:
         self.pivot += step[:, :3]
         for f in range(len(self.pivot)):
             before = self.rot[f].copy()
-            _kernels.rotate(step[f, 3:6], before, self.rot[f])
+            rotate(step[f, 3:6], before, self.rot[f])
         self.clock += step[:, 6 : 6 + self.clock[0].size].reshape(self.clock.shape)
         n_place = self.places.size
         self.places += move[:n_place].reshape(-1, 3)
@@ -262,10 +241,9 @@ class _State:
         seen = value > _UNSEEN * value[-1]
         unseen = vector[:, ~seen].T
         # a posture's own unknowns are counted with it; what all share, here
-        n_posture, surveyed = len(self.pivot), 3 * self.problem.knowledge.has_pivot
-        dof = float(self.problem.equations.dof.sum() - surveyed * n_posture - int(seen.sum()))
+        dof = float(self.problem.dof.sum() - int(seen.sum()))
         if self.common_pivot:
-            dof += 3 * n_posture - 3 + surveyed
+            dof += 3 * len(self.pivot) - 3 + 3 * self.surveyed
         names, modes = _name(unseen, self.places)
         return ReceiverPlaces(
             receiver_mirror_m=read_only(self.places),

@@ -13,15 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.multilat.reflection import direct_rays
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.problem import MirrorProblem, start_clock
+from rfpose.multilat.rigid.fits import FLOOR, Rule, begin, fit
+from rfpose.multilat.rigid.problem import MirrorProblem
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["RigidPoses", "full_covariance", "rigid_bound", "solve_rigid", "tilt_sigma_rad"]
 
-_MAX_ITERATION = 40
-_FLOOR = 1e-13
-"""Smallest share of an unknown's information that the other unknowns may leave before it counts as unobserved."""
+_RULE = Rule(max_iteration=40, floor=FLOOR, longest_turn=0.5, settled=1e-6)  # a thousandth of a sigma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,53 +74,24 @@ def tilt_sigma_rad(cov: FloatArray, normal_enu: FloatArray) -> FloatArray:
 
 def solve_rigid(problem: MirrorProblem) -> RigidPoses:
     """Solve rigid poses of many mirrors by Gauss-Newton; whole wavelengths count as resolved."""
-    n_mirror = len(problem.range_m)
-    equations, classes = problem.equations, problem.clock_class
-    pivot, rot = problem.start_pivot_enu_m.copy(), problem.start_rot_enu_from_mirror.copy()
-    transmitter, places = problem.transmitter_enu_m, problem.receiver_mirror_m
-    clock = start_clock(problem, pivot, rot)
-    status = np.zeros(n_mirror, np.int64)
-    status[np.sum(equations.weight > 0, axis=(1, 2, 3)) < 4] = PoseStatus.UNKNOWNS
+    mirrors = problem.equations
+    status = np.zeros(len(problem.range_m), np.int64)
+    status[np.sum(mirrors.weight > 0, axis=(1, 2, 3)) < 4] = PoseStatus.UNKNOWNS
     status[~problem.has_start] = PoseStatus.TOO_FEW
-    cov = np.full((n_mirror, 6, 6), np.nan)
-    chi2 = np.full(n_mirror, np.nan)
-    n_iteration = np.zeros(n_mirror, np.int64)
-    _kernels.solve_many(
-        n_mirror,
-        transmitter,
-        places,
-        np.nan_to_num(problem.range_m),
-        equations.weight,
-        equations.bias_info,
-        classes,
-        equations.pivot,
-        equations.pivot_info,
-        equations.roll_info,
-        equations.clock_own,
-        equations.clock_tie,
-        clock.copy(),
-        _MAX_ITERATION,
-        _FLOOR,
-        pivot,
-        rot,
-        clock,
-        cov,
-        chi2,
-        n_iteration,
-        status,
-    )
-    bad = status != PoseStatus.OK
-    for array in (pivot, rot, clock, cov, chi2):
+    fits = begin(mirrors, problem.start_pivot_enu_m, problem.start_rot_enu_from_mirror, status, n_cov=6)
+    fit(direct_rays(problem.transmitter_enu_m, mirrors.z.shape[1]), mirrors, _RULE, fits)
+    bad = fits.status != PoseStatus.OK
+    for array in (fits.pivot, fits.rot, fits.clock, fits.cov, fits.chi2):
         array[bad] = np.nan
     return RigidPoses(
-        pivot_enu_m=pivot,
-        rot_enu_from_mirror=rot,
-        clock_m=clock,
-        cov=cov,
-        chi2=chi2,
-        dof=equations.dof,
-        n_iteration=n_iteration,
-        status=status,
+        pivot_enu_m=fits.pivot,
+        rot_enu_from_mirror=fits.rot,
+        clock_m=fits.clock,
+        cov=fits.cov,
+        chi2=fits.chi2,
+        dof=problem.dof,
+        n_iteration=fits.n_iteration,
+        status=fits.status,
     )
 
 
@@ -148,24 +119,18 @@ def full_covariance(problem: MirrorProblem) -> FloatArray:
     (mirror, unknown, unknown)
         Order: pivot, rotation, then clocks by class and receiver. NaN where the pose is not determined.
     """
-    n_mirror, _, n_receiver, _ = problem.range_m.shape
-    equations = problem.equations
+    mirrors = problem.weighed()
+    n_mirror, _, n_receiver, _ = mirrors.z.shape
     n_unknown = 6 + problem.n_class * n_receiver
     cov = np.full((n_mirror, n_unknown, n_unknown), np.nan)
     _kernels.covariance_many(
         n_mirror,
-        problem.transmitter_enu_m,
-        problem.receiver_mirror_m,
-        equations.weight,
-        equations.bias_info,
-        problem.clock_class,
-        equations.pivot_info,
-        equations.roll_info,
-        equations.clock_own,
-        equations.clock_tie,
-        _FLOOR,
+        direct_rays(problem.transmitter_enu_m, mirrors.z.shape[1]),
+        mirrors,
+        FLOOR,
         problem.start_pivot_enu_m,
         problem.start_rot_enu_from_mirror,
+        mirrors.prior.clock,
         cov,
     )
     return cov

@@ -12,11 +12,20 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.multilat.equations import Mirrors, Prior
+from rfpose.multilat.reflection import direct_rays
+from rfpose.multilat.rigid import _kernels
 
-__all__ = ["Equations", "Knowledge", "MirrorProblem", "Observation", "degrees_of_freedom", "start_clock"]
+__all__ = ["PRIORS", "Knowledge", "MirrorProblem", "Observation"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+
+PRIORS = ("pivot", "mount", "clocks")
+"""What a mirror may rest on besides its phases."""
+
+STIFFEST_TIE = 1e-8
+"""Smallest variance of a receiver's delay, in units of the best observation's: stiff enough to be a shared clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +118,8 @@ class MirrorProblem:
     wavelength_m : (group, transmitter)
         [m]; NaN where whole wavelengths are resolved already and nobody asks.
     is_carrier : (group,)
+    dropped : (mirror, prior)
+        Which of `PRIORS` is known but not used.
     """
 
     transmitter_enu_m: FloatArray
@@ -122,6 +133,7 @@ class MirrorProblem:
     knowledge: Knowledge
     wavelength_m: FloatArray
     is_carrier: BoolArray
+    dropped: BoolArray
 
     @classmethod
     def of(
@@ -171,6 +183,7 @@ class MirrorProblem:
             knowledge=known,
             wavelength_m=np.full((n_group, n_transmitter), np.nan),
             is_carrier=np.zeros(n_group, np.bool_),
+            dropped=np.zeros((n_mirror, len(PRIORS)), np.bool_),
         )
 
     @classmethod
@@ -266,6 +279,7 @@ class MirrorProblem:
             start_pivot_enu_m=self.start_pivot_enu_m[rows],
             start_rot_enu_from_mirror=self.start_rot_enu_from_mirror[rows],
             knowledge=self.knowledge.take(rows),
+            dropped=self.dropped[rows],
         )
 
     def groups(self, which: slice) -> MirrorProblem:
@@ -310,97 +324,92 @@ class MirrorProblem:
         pivot, rot = self.start_pivot_enu_m, self.start_rot_enu_from_mirror
         return np.asarray(np.isfinite(pivot).all(axis=1) & np.isfinite(rot).all(axis=(1, 2)))
 
+    @property
+    def has_prior(self) -> BoolArray:
+        """(mirror, prior) which of `PRIORS` is used."""
+        known = self.knowledge
+        given = np.array([known.has_pivot, known.two_axis, np.isfinite(known.clock_sigma_m)])
+        return np.asarray(given & ~self.dropped)
+
     @cached_property
-    def equations(self) -> Equations:
-        """What the solvers' equations weigh."""
-        return _equations(self)
+    def equations(self) -> Mirrors:
+        """What the solvers' equations weigh; clocks begin, and stay if nothing moves them, where they fit best."""
+        mirrors = self.weighed()
+        scene = direct_rays(self.transmitter_enu_m, self.range_m.shape[1])
+        _kernels.clocks_many(
+            len(self.range_m), scene, mirrors, self.start_pivot_enu_m, self.start_rot_enu_from_mirror,
+            mirrors.prior.clock,
+        )  # fmt: skip
+        return mirrors
 
+    def weighed(self, stiffest_tie: float = STIFFEST_TIE) -> Mirrors:
+        """`equations` about clocks of zero, where a shared clock is no stiffer than told (see `STIFFEST_TIE`)."""
+        known, has, n_mirror = self.knowledge, self.has_prior, len(self.range_m)
+        sigma, common = self.sigma_m, self.transmitter_sigma_m
+        seen = np.isfinite(self.range_m) & np.isfinite(sigma)
+        weight = np.where(seen, 1.0 / np.where(seen, sigma, 1.0) ** 2, 0.0)
+        with np.errstate(divide="ignore"):
+            bias_info = np.array(np.where(np.isnan(common), 0.0, 1.0 / common**2))
+        own, tie = self._clock_ties(weight, bias_info, stiffest_tie)
+        return Mirrors(
+            receiver_mirror=np.ascontiguousarray(self.receiver_mirror_m),
+            z=np.nan_to_num(self.range_m),
+            weight=weight,
+            bias_info=bias_info,
+            clock_class=self.clock_class,
+            prior=Prior(
+                pivot=np.zeros((n_mirror, 3)) if known.pivot_enu_m is None else np.array(known.pivot_enu_m),
+                pivot_info=has[:, 0, None, None] * (np.eye(3) / known.pivot_sigma_m**2),
+                roll_info=np.where(has[:, 1], known.roll_sigma_rad**-2, 0.0),
+                clock_own=own,
+                clock_tie=tie,
+                clock=np.zeros_like(own),
+            ),
+            frame=np.zeros(n_mirror, np.int64),
+        )
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Equations:
-    """Weights of measurements and priors, as kernels take them.
+    @cached_property
+    def dof(self) -> FloatArray:
+        """(mirror,) measurements and priors less unknowns: what chi² should be."""
+        weight, bias_info, has = self.equations.weight, self.equations.bias_info, self.has_prior
+        seen = weight > 0.0
+        n = seen.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0 + has[:, :2] @ [3, 1]
+        n -= (np.any(seen, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
+        for k in range(self.n_class):
+            mine = self.clock_class == k
+            clocks = np.any(seen[:, mine], axis=(1, 3)).sum(axis=1)
+            free = np.where(has[:, 2], np.minimum(clocks, 1), clocks)
+            # without calibration a common clock is the transmitters' as well, and counted with them
+            calibrated = np.any(bias_info[:, mine] > 0.0, axis=(1, 2))
+            n -= np.where(calibrated, free, np.maximum(free - 1, 0))
+        return np.asarray(n)
 
-    Attributes
-    ----------
-    weight : (mirror, group, receiver, transmitter)
-        1/σ² of each range, zero where it is not received.
-    bias_info : (mirror, group, transmitter)
-        1/σ² of what transmitters are off by: zero without calibration, infinite where exact.
-    pivot, pivot_info : (mirror, xyz), (mirror, 3, 3)
-        Surveyed pivots and their information, zero where unknown.
-    roll_info
-        Of the mount.
-    clock_own, clock_tie : (mirror, class, receiver), (mirror, class, receiver, receiver)
-        Information on each clock and on the differences between clocks.
-    dof : (mirror,)
-        Measurements and priors less unknowns.
-    """
+    def _clock_ties(self, weight: FloatArray, bias_info: FloatArray, stiffest: float) -> tuple[FloatArray, FloatArray]:
+        """Information on each clock and on the differences between clocks.
 
-    weight: FloatArray
-    bias_info: FloatArray
-    pivot: FloatArray
-    pivot_info: FloatArray
-    roll_info: float
-    clock_own: FloatArray
-    clock_tie: FloatArray
-    dof: FloatArray
-
-
-def _equations(problem: MirrorProblem) -> Equations:
-    known, n_mirror = problem.knowledge, len(problem.range_m)
-    sigma, common = problem.sigma_m, problem.transmitter_sigma_m
-    seen = np.isfinite(problem.range_m) & np.isfinite(sigma)
-    weight = np.where(seen, 1.0 / np.where(seen, sigma, 1.0) ** 2, 0.0)
-    with np.errstate(divide="ignore"):
-        bias_info = np.array(np.where(np.isnan(common), 0.0, 1.0 / common**2))
-    pivot, pivot_info = np.zeros((n_mirror, 3)), np.zeros((n_mirror, 3, 3))
-    if known.pivot_enu_m is not None:
-        pivot = np.array(known.pivot_enu_m)
-        if known.has_pivot:
-            pivot_info[:] = np.eye(3) / known.pivot_sigma_m**2
-    own, tie = _clock_ties(known.clock_sigma_m, weight, bias_info, problem.clock_class, problem.n_class)
-    return Equations(
-        weight=weight,
-        bias_info=bias_info,
-        pivot=pivot,
-        pivot_info=pivot_info,
-        roll_info=known.roll_sigma_rad**-2 if known.two_axis else 0.0,
-        clock_own=own,
-        clock_tie=tie,
-        dof=degrees_of_freedom(
-            weight,
-            bias_info,
-            problem.clock_class,
-            tied=np.full(n_mirror, np.isfinite(known.clock_sigma_m)),
-            n_prior=np.full(n_mirror, 3 * known.has_pivot + known.two_axis),
-        ),
-    )
-
-
-def degrees_of_freedom(
-    weight: FloatArray, bias_info: FloatArray, clock_class: IntArray, *, tied: BoolArray, n_prior: IntArray
-) -> FloatArray:
-    """Count measurements and priors less unknowns (mirror,).
-
-    Parameters
-    ----------
-    weight, bias_info, clock_class
-        As in `Equations` and `MirrorProblem`.
-    tied : (mirror,)
-        Whether a mirror's receivers have one clock.
-    n_prior : (mirror,)
-        What pivot and mount give.
-    """
-    seen = weight > 0.0
-    n = seen.sum(axis=(1, 2, 3)).astype(np.float64) - 6.0 + n_prior
-    n -= (np.any(seen, axis=2) & (bias_info == 0.0)).sum(axis=(1, 2))
-    for k in range(int(clock_class.max()) + 1):
-        clocks = np.any(seen[:, clock_class == k], axis=(1, 3)).sum(axis=1)
-        free = np.where(tied, np.minimum(clocks, 1), clocks)
-        # without calibration a common clock is the transmitters' as well, and counted with them
-        calibrated = np.any(bias_info[:, clock_class == k] > 0.0, axis=(1, 2))
-        n -= np.where(calibrated, free, np.maximum(free - 1, 0))
-    return np.asarray(n)
+        Clocks c + δ_r with δ_r of standard deviation s have differences of information 1/(R s²) a pair. Where no
+        transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says
+        nothing.
+        """
+        n_mirror, _, n_receiver, _ = weight.shape
+        own = np.zeros((n_mirror, self.n_class, n_receiver))
+        tie = np.zeros((n_mirror, self.n_class, n_receiver, n_receiver))
+        tied = self.has_prior[:, 2]
+        for k in range(self.n_class):
+            mine = self.clock_class == k
+            # each mirror's and class's own scale: no mirror's result depends on its neighbours, and the stiffest tie of
+            # a coarse tone stays comparable with what that tone observes
+            largest = np.maximum(weight[:, mine].max(axis=(1, 2, 3), initial=0.0), 1e-300)
+            known = np.any(bias_info[:, mine] > 0.0, axis=(1, 2))
+            own[:, k, 0] = np.where(known, 0.0, largest)
+            # a clock that nothing observes is held as well; it takes part in nothing
+            seen = np.any(weight[:, mine] > 0.0, axis=(1, 3))
+            lost = np.where(tied[:, None], ~seen.any(axis=1, keepdims=True) & (np.arange(n_receiver) == 0), ~seen)
+            own[:, k] = np.where(lost, largest[:, None], own[:, k])
+            if tied.any():
+                stiff = largest / (n_receiver * np.maximum(self.knowledge.clock_sigma_m**2 * largest, stiffest))
+                tie[:, k] = np.where(tied, stiff, 0.0)[:, None, None]
+        return own, tie
 
 
 def _places(receiver_mirror_m: npt.ArrayLike, n_mirror: int, n_receiver: int) -> FloatArray:
@@ -414,48 +423,3 @@ def _places(receiver_mirror_m: npt.ArrayLike, n_mirror: int, n_receiver: int) ->
 
 def _spread(values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     return np.array(np.broadcast_to(np.asarray(values, np.float64), shape))
-
-
-def _clock_ties(
-    clock_sigma_m: float,
-    weight: FloatArray,
-    bias_info: FloatArray,
-    classes: npt.NDArray[np.int64],
-    n_class: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Information on each clock and on the differences between clocks.
-
-    Clocks c + δ_r with δ_r of standard deviation s have differences of information 1/(R s²) a pair. Where no
-    transmitter is calibrated a common clock is theirs as well: the first receiver's is then held, which says nothing.
-    """
-    n_mirror, _, n_receiver, _ = weight.shape
-    own = np.zeros((n_mirror, n_class, n_receiver))
-    tie = np.zeros((n_mirror, n_class, n_receiver, n_receiver))
-    for k in range(n_class):
-        # each mirror's and class's own scale: no mirror's result depends on its neighbours, and the stiffest tie of a
-        # coarse tone stays comparable with what that tone observes
-        largest = np.maximum(weight[:, classes == k].max(axis=(1, 2, 3), initial=0.0), 1e-300)
-        known = np.any(bias_info[:, classes == k] > 0.0, axis=(1, 2))
-        own[:, k, 0] = np.where(known, 0.0, largest)
-        # a clock that nothing observes is held as well; it takes part in nothing
-        seen = np.any(weight[:, classes == k] > 0.0, axis=(1, 3))
-        if np.isfinite(clock_sigma_m):
-            own[:, k, 0] = np.where(seen.any(axis=1), own[:, k, 0], largest)
-            tie[:, k] = (largest / (n_receiver * np.maximum(clock_sigma_m**2 * largest, 1e-8)))[:, None, None]
-        else:
-            own[:, k] = np.where(seen, own[:, k], largest[:, None])
-    return own, tie
-
-
-def start_clock(problem: MirrorProblem, pivot_enu_m: FloatArray, rot_enu_from_mirror: FloatArray) -> FloatArray:
-    """Clocks (mirror, class, receiver) that fit poses, one a mirror and class: the mean of range less distance."""
-    receiver = pivot_enu_m[:, None] + np.einsum("mab,mrb->mra", rot_enu_from_mirror, problem.receiver_mirror_m)
-    distance = np.linalg.norm(receiver[:, :, None] - problem.transmitter_enu_m, axis=-1)
-    out = np.zeros((len(receiver), problem.n_class, receiver.shape[1]))
-    for k in range(problem.n_class):
-        left = problem.range_m[:, problem.clock_class == k] - distance[:, None]
-        seen = np.isfinite(left)
-        count = seen.sum(axis=(1, 2, 3))
-        total = np.where(seen, left, 0.0).sum(axis=(1, 2, 3))
-        out[:, k] = np.where(count > 0, total / np.maximum(count, 1), 0.0)[:, None]
-    return out

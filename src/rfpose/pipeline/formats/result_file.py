@@ -21,8 +21,8 @@ from rfpose.files import write_atomically
 from rfpose.kinds import kind_of
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, RangeDifferences, RangeStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
-from rfpose.multilat.integrity.hypotheses import PRIORS
 from rfpose.multilat.rigid.integers import IntegerMethod
+from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.columns import (
     ENU,

@@ -12,7 +12,8 @@ from rfpose.dsp import Calibration, TonePhases
 from rfpose.dsp.calibration import frame_times, phase_average
 from rfpose.measurement import reflectors_of
 from rfpose.multilat import FixStatus, RangeDifferences
-from rfpose.multilat.estimation import Alarms, Found, Reflections, solve_direct, solve_two_ray
+from rfpose.multilat.estimation import Found, Reflections, solve_direct, solve_two_ray
+from rfpose.multilat.integrity import Alarms
 from rfpose.multilat.rigid import MirrorProblem
 from rfpose.multilat.rigid.integers import align_points
 from rfpose.multilat.rigid.start import rotations_from_differences
