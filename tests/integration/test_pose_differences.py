@@ -11,6 +11,7 @@ import pytest
 from rfpose.dsp import CalibrationStatus
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.multilat import FixStatus, RangeStatus
+from rfpose.multilat.rigid import Knowledge, MirrorProblem
 from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Evaluation, evaluate
@@ -154,14 +155,18 @@ def test_the_start_finds_any_orientation(clock_sigma_m: float) -> None:
     if clock_sigma_m > 0.0:
         z += 100.0 * rng.normal(size=(n, 3, 1))
     z[:, 1, 2] = np.nan
-    found = rotations_from_differences(
+    problem = MirrorProblem.of(
         transmitter,
-        np.tile(places, (n, 1, 1)),
-        pivot,
-        z,
-        sigma_m=np.full(z.shape, 1e-3),
-        clock_sigma_m=clock_sigma_m,
+        places,
+        z[:, None],
+        sigma_m=1e-3,
+        transmitter_sigma_m=np.inf,
+        clock_class=[0],
+        start_pivot_enu_m=pivot,
+        start_rot_enu_from_mirror=np.nan,
+        knowledge=Knowledge(clock_sigma_m=clock_sigma_m),
     )
+    found = rotations_from_differences(problem)
     angle = np.arccos(np.clip((np.einsum("mab,mab->m", found, turn) - 1.0) / 2.0, -1.0, 1.0))
     # parallax is left out: a start, good to a few degrees
     assert np.median(angle) < 0.1

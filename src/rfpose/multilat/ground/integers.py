@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.rigid.integers import common_offset
-from rfpose.multilat.rigid.problem import Knowledge, Observation
+from rfpose.multilat.rigid.problem import MirrorProblem
 
 __all__ = ["resolve"]
 
@@ -16,27 +16,25 @@ IntArray = npt.NDArray[np.int64]
 
 
 def resolve(
-    observation: Observation,
+    problem: MirrorProblem,
+    k: int,
     predicted: FloatArray,
     uncertainty: float | tuple[FloatArray, FloatArray],
-    known: Knowledge,
     offset_m: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Round ranges to the wavelength nearest to the prediction.
+    """Round ranges of wavelength k to the turn nearest to the prediction.
 
     Without calibration only differences to a transmitter's first receiver mean anything; with a clock for each
     receiver only what is left of them when a receiver's common offset is taken off.
 
     Parameters
     ----------
-    observation
+    problem, k
     predicted : (mirror, receiver, transmitter)
         Ranges [m].
     uncertainty
         Of the prediction: one standard deviation of all [m], or the derivative (mirror, receiver, transmitter, k) and
         the covariance (mirror, k, k) of what it was made of.
-    known
-        For the clocks.
     offset_m : (mirror, receiver, 1), optional
         Receivers' common offsets as a coarser tone gave them: the same clock moves both.
 
@@ -51,6 +49,7 @@ def resolve(
     """
     from scipy.special import erfc
 
+    observation, known = problem.observation(k), problem.knowledge
     seen = np.isfinite(observation.range_m)
     left = observation.range_m - predicted
     noise = np.broadcast_to(observation.sigma_m, left.shape) ** 2

@@ -131,7 +131,7 @@ def solve_with_ground(
     GeometryError
         A transmitter behind a reflector.
     """
-    known, n_tone = mirrors.knowledge, mirrors.n_tone
+    n_tone = mirrors.n_tone
     observations = [mirrors.observation(k) for k in range(len(mirrors.clock_class))]
     transmitter, places, n_mirror = mirrors.transmitter_enu_m, mirrors.receiver_mirror_m, len(mirrors.range_m)
     pivot, rot = mirrors.start_pivot_enu_m, mirrors.start_rot_enu_from_mirror
@@ -164,7 +164,7 @@ def solve_with_ground(
     ranges = []
     offset = None
     for k in range(n_tone):
-        resolved, risk[:, k], offset = resolve(observations[k], distance, float(start_sigma_m), known, offset)
+        resolved, risk[:, k], offset = resolve(mirrors, k, distance, float(start_sigma_m), offset)
         ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
     problem = lay_out(ranges, pivot, rot)
     status[(status == PoseStatus.OK) & (problem.dof < 0)] = PoseStatus.UNKNOWNS
@@ -185,7 +185,7 @@ def solve_with_ground(
         # a pose that does not explain its tones predicts no carrier
         sound = ~(_probability(state.chi2, problem.dof, state.status == PoseStatus.OK) < min_probability)
         for k in range(n_tone, len(observations)):
-            resolved, risk[:, k], _ = resolve(observations[k], predicted[:, k], (slope[:, k], cov), known)
+            resolved, risk[:, k], _ = resolve(mirrors, k, predicted[:, k], (slope[:, k], cov))
             risk[~sound, k] = 1.0
             ranges.append(np.where((risk[:, k] <= wrong_risk)[:, None, None], resolved, np.nan))
         problem = lay_out(ranges, state.pivot, state.rot)

@@ -70,6 +70,36 @@ class Fits(NamedTuple):
             array[rows] = new
 
 
+class Ambiguous(NamedTuple):
+    """Ranges whose integers are sought, one wavelength of many mirrors; mirror is the first axis.
+
+    ``left`` (mirror, receiver, transmitter) ranges less prediction; ``slope`` (…, 6) their derivative by the pose of
+    covariance ``pose_cov``; ``own_m2`` each range's own variance, ``common_m2`` (mirror, transmitter) that common to
+    receivers, ``clock_m2`` that of a receiver's clock. From range (r, i) comes off that of receiver ``minus[m, i]``
+    (−1: none) and the difference of transmitter ``reference[m, r, 1]`` at receiver ``reference[m, r, 0]`` (−1: none).
+    """
+
+    left: Float64
+    slope: Float64
+    pose_cov: Float64
+    own_m2: Float64
+    common_m2: Float64
+    clock_m2: float
+    wavelength: Float64
+    minus: Int64
+    reference: Int64
+
+
+class Differences(NamedTuple):
+    """Differences of `Ambiguous` ranges [cycles]: how many, value, covariance, receiver and transmitter of each."""
+
+    n_sought: Int64
+    value: Float64
+    cov: Float64
+    row: Int64
+    column: Int64
+
+
 @kernel
 def _arm(rot, place):
     return (
@@ -350,3 +380,73 @@ def covariance_many(begin, end, scene, mirrors, floor, pivot, rot, clock, cov):
         add_prior(mirrors.prior, m, rot[m], info, 0, 6)
         if factor(info, floor):
             covariance(info, cov[m])
+
+
+@kernel
+def _terms(r, i, q, r0, i0, receiver, transmitter, sign):
+    """Signed raw ranges of one difference: (r, i), less receiver q, less the reference (r0, i0); −1 = not taken off."""
+    n = 1
+    receiver[0], transmitter[0], sign[0] = r, i, 1.0
+    if q >= 0:
+        receiver[n], transmitter[n], sign[n] = q, i, -1.0
+        n += 1
+    if i0 >= 0:
+        receiver[n], transmitter[n], sign[n] = r0, i0, -1.0
+        n += 1
+        if q >= 0:
+            receiver[n], transmitter[n], sign[n] = q, i0, 1.0
+            n += 1
+    return n
+
+
+@kernel_rows
+def difference_many(begin, end, seen, out):
+    """Differences of ranges whose integers are sought, in cycles, and their covariance; see `Ambiguous`."""
+    left, slope, pose_cov, minus, reference = seen.left, seen.slope, seen.pose_cov, seen.minus, seen.reference
+    value, cov, row, column, wavelength = out.value, out.cov, out.row, out.column, seen.wavelength
+    n_receiver, n_transmitter = left.shape[1:]
+    for m in range(begin, end):
+        size = n_receiver * n_transmitter
+        receivers, transmitters = np.empty((size, 4), np.int64), np.empty((size, 4), np.int64)
+        signs, n_term = np.empty((size, 4)), np.empty(size, np.int64)
+        slopes, spread = np.empty((size, 6)), np.empty(6)
+        n = 0
+        for r in range(n_receiver):
+            for i in range(n_transmitter):
+                q, r0, i0 = minus[m, i], reference[m, r, 0], reference[m, r, 1]
+                if r == q or (r == r0 and i == i0) or not math.isfinite(left[m, r, i]):
+                    continue
+                if i0 >= 0 and q >= 0 and (i == i0 or not math.isfinite(left[m, q, i])):
+                    continue
+                n_term[n] = _terms(r, i, q, r0, i0, receivers[n], transmitters[n], signs[n])
+                total = 0.0
+                slopes[n] = 0.0
+                for t in range(n_term[n]):
+                    total += signs[n, t] * left[m, receivers[n, t], transmitters[n, t]]
+                    for a in range(6):
+                        slopes[n, a] += signs[n, t] * slope[m, receivers[n, t], transmitters[n, t], a]
+                value[m, n] = total / wavelength[i]
+                row[m, n], column[m, n] = r, i
+                n += 1
+        out.n_sought[m] = n
+        for j in range(n):
+            for a in range(6):
+                spread[a] = 0.0
+                for b in range(6):
+                    spread[a] += pose_cov[m, a, b] * slopes[j, b]
+            for k in range(j + 1):
+                total = 0.0
+                for a in range(6):
+                    total += slopes[k, a] * spread[a]
+                for s in range(n_term[j]):
+                    for t in range(n_term[k]):
+                        both = signs[j, s] * signs[k, t]
+                        same = receivers[j, s] == receivers[k, t]
+                        if same:
+                            total += both * seen.clock_m2
+                        if transmitters[j, s] == transmitters[k, t]:
+                            total += both * seen.common_m2[m, transmitters[j, s]]
+                            if same:
+                                total += both * seen.own_m2[m, receivers[j, s], transmitters[j, s]]
+                cov[m, j, k] = total / (wavelength[column[m, j]] * wavelength[column[m, k]])
+                cov[m, k, j] = cov[m, j, k]

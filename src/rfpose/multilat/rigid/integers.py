@@ -17,7 +17,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid.pose import RigidPoses, solve_rigid
-from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid.problem import MirrorProblem
 from rfpose.multilat.rigid.search import (
     DELAY_REACH_M,
     Candidates,
@@ -186,9 +186,8 @@ class _Ladder:
 
     def __init__(self, problem: MirrorProblem, wrong_risk: float) -> None:
         shape = problem.range_m.shape[:2]
-        self.problem, self.known, self.limit = problem, problem.knowledge, wrong_risk
-        self.observations = [problem.observation(k) for k in range(shape[1])]
-        self.resolved = [np.full(o.range_m.shape, np.nan) for o in self.observations]
+        self.problem, self.limit = problem, wrong_risk
+        self.resolved = [np.full(problem.range_m[:, k].shape, np.nan) for k in range(shape[1])]
         self.resolved[0] = np.array(problem.range_m[:, 0])
         self.method = np.full(shape, IntegerMethod.FLOAT, np.int64)
         self.method[:, 0] = IntegerMethod.GIVEN
@@ -212,15 +211,13 @@ class _Ladder:
 
     def climb(self, k: int, poses: RigidPoses, *, search: bool) -> RigidPoses:
         """Resolve observation k where that is safe, and solve with it."""
-        observation = self.observations[k]
-        prediction = predict(self.problem.transmitter_enu_m, self.problem.receiver_mirror_m, poses)
-        ranges, self.risk[:, k] = _round(observation, prediction, self.known)
+        prediction = predict(self.problem, poses)
+        ranges, self.risk[:, k] = _round(self.problem, k, prediction)
         rounding_risk = self.risk[:, k].copy()
         limit = min(self.limit, _SAFE_ROUNDING) if search else self.limit
         self._take_rounded(k, ranges, np.less_equal(rounding_risk, limit))
         unsafe = np.flatnonzero((self.method[:, k] == IntegerMethod.FLOAT) & (poses.status == PoseStatus.OK))
-        calibrated = bool(np.isfinite(observation.transmitter_sigma_m).all())
-        if search and len(unsafe) and can_search(calibrated, observation.wavelength_m):
+        if search and len(unsafe) and can_search(self.problem, k):
             self._search(k, unsafe, poses, prediction)
         left: BoolArray = np.equal(self.method[:, k], IntegerMethod.FLOAT) & (rounding_risk <= self.limit)
         self._take_rounded(k, ranges, left)
@@ -245,21 +242,8 @@ class _Ladder:
 
     def _search(self, k: int, mirrors: IntArray, poses: RigidPoses, prediction: Prediction) -> None:
         """Resolve by least squares what could not be rounded."""
-        observation = self.observations[k]
         for part in np.array_split(mirrors, -(-len(mirrors) // _SEARCH_ROWS)):
-            found = search_integers(
-                observation.range_m[part],
-                np.broadcast_to(observation.sigma_m, observation.range_m.shape)[part],
-                observation.transmitter_sigma_m[part],
-                observation.wavelength_m,
-                Prediction(
-                    distance_m=prediction.distance_m[part],
-                    slope=prediction.slope[part],
-                    cov=prediction.cov[part],
-                    bend_m=prediction.bend_m[part],
-                ),
-                self.known,
-            )
+            found = search_integers(self.problem.take(part), k, prediction.take(part))
             risk, odds = found.wrong_risk.copy(), found.odds_against.copy()
             chosen = np.zeros(len(part), np.int64)
             method = np.full(len(part), IntegerMethod.LEAST_SQUARES, np.int64)
@@ -328,10 +312,11 @@ def _is_unlikely(poses: RigidPoses) -> BoolArray:
     return np.asarray(rare | (poses.status == PoseStatus.NOT_CONVERGED))
 
 
-def _round(observation: Observation, prediction: Prediction, known: Knowledge) -> tuple[FloatArray, FloatArray]:
-    """Round the integers of one observation; return resolved ranges and the risk that any is wrong (mirror,)."""
+def _round(problem: MirrorProblem, k: int, prediction: Prediction) -> tuple[FloatArray, FloatArray]:
+    """Round the integers of wavelength k; return resolved ranges and the risk that any is wrong (mirror,)."""
     from scipy.special import erfc
 
+    observation, known = problem.observation(k), problem.knowledge
     slope = prediction.slope
     wavelength = observation.wavelength_m
     left = observation.range_m - prediction.distance_m

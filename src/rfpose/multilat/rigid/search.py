@@ -7,15 +7,16 @@ and their covariance knows it. Integer least squares uses all of it; a range rou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.ambiguity import difference_many, integer_least_squares
+from rfpose.multilat.ambiguity import integer_least_squares
+from rfpose.multilat.rigid import _kernels
 from rfpose.multilat.rigid.pose import RigidPoses
-from rfpose.multilat.rigid.problem import Knowledge
+from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem
 
 __all__ = ["Candidates", "Prediction", "can_search", "predict", "search_integers"]
 
@@ -53,6 +54,10 @@ class Prediction:
     cov: FloatArray
     bend_m: FloatArray
 
+    def take(self, rows: IntArray) -> Prediction:
+        """Select mirrors."""
+        return Prediction(**{f.name: getattr(self, f.name)[rows] for f in fields(Prediction)})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
@@ -81,10 +86,10 @@ class Candidates:
     adop_cycles: FloatArray
 
 
-def predict(transmitter_enu_m: FloatArray, receiver_mirror_m: FloatArray, poses: RigidPoses) -> Prediction:
+def predict(problem: MirrorProblem, poses: RigidPoses) -> Prediction:
     """Return distances at the given poses, with their derivative."""
-    arm = np.einsum("mab,mrb->mra", poses.rot_enu_from_mirror, receiver_mirror_m)
-    to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - transmitter_enu_m
+    arm = np.einsum("mab,mrb->mra", poses.rot_enu_from_mirror, problem.receiver_mirror_m)
+    to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - problem.transmitter_enu_m
     distance = np.linalg.norm(to_receiver, axis=-1)
     direction = to_receiver / distance[..., None]
     # d = |p + exp(θ)a − T| to second order: ½ [(θ·a)(θ·u) − |θ|²(a·u)], at most |a| |θ|²; an arm's end moves by no
@@ -99,55 +104,49 @@ def predict(transmitter_enu_m: FloatArray, receiver_mirror_m: FloatArray, poses:
     )
 
 
-def can_search(calibrated: bool, wavelength_m: FloatArray) -> bool:
-    """Tell whether integers are defined: an unknown common clock and unequal wavelengths leave none."""
-    return not calibrated or bool(np.ptp(wavelength_m) == 0.0)
+def can_search(problem: MirrorProblem, k: int) -> bool:
+    """Tell whether wavelength k's integers are defined: a common clock and unequal wavelengths leave none."""
+    calibrated = bool(np.isfinite(problem.transmitter_sigma_m[:, k]).all())
+    return not calibrated or bool(np.ptp(problem.wavelength_m[k]) == 0.0)
 
 
-def search_integers(
-    range_m: FloatArray,
-    sigma_m: FloatArray,
-    transmitter_sigma_m: FloatArray,
-    wavelength_m: FloatArray,
-    prediction: Prediction,
-    known: Knowledge,
-) -> Candidates:
-    """Find the likeliest integers of one observation for every mirror.
-
-    Parameters
-    ----------
-    range_m, sigma_m : (mirror, receiver, transmitter)
-        Ranges up to whole wavelengths, and their own noise [m].
-    transmitter_sigma_m : (mirror, transmitter)
-        Error common to receivers; infinity = differences between receivers only [m].
-    wavelength_m : (transmitter,)
-        [m].
-    prediction
-        Of the same mirrors.
-    known
-        For the clocks.
-    """
+def search_integers(problem: MirrorProblem, k: int, prediction: Prediction) -> Candidates:
+    """Find the likeliest integers of wavelength k for every mirror, of whose poses so far ``prediction`` is."""
+    range_m, sigma_m, wavelength_m = problem.range_m[:, k], problem.sigma_m[:, k], problem.wavelength_m[k]
+    transmitter_sigma_m = problem.transmitter_sigma_m[:, k]
     calibrated = bool(np.isfinite(transmitter_sigma_m).all())
     seen = np.isfinite(range_m) & np.isfinite(sigma_m)
     left = np.where(seen, range_m - prediction.distance_m, np.nan)
     floor = _NOISE_FLOOR_CYCLES * wavelength_m
     own = np.where(seen, np.maximum(np.where(seen, sigma_m, 0.0), floor) ** 2, 0.0)
     bend = prediction.bend_m[:, :, None] ** 2
-    minus, reference, clock_m2 = _references(seen, calibrated, wavelength_m, known)
-    common = np.asarray(transmitter_sigma_m**2 if calibrated else np.zeros(range_m.shape[::2]))
+    minus, reference, clock_m2 = _references(seen, calibrated, wavelength_m, problem.knowledge)
     size = range_m.shape[1] * range_m.shape[2]
+    ranges = _kernels.Ambiguous(
+        left=left,
+        slope=prediction.slope,
+        pose_cov=prediction.cov,
+        own_m2=own,
+        common_m2=np.asarray(transmitter_sigma_m**2 if calibrated else np.zeros(range_m.shape[::2])),
+        clock_m2=clock_m2,
+        wavelength=wavelength_m,
+        minus=minus,
+        reference=reference,
+    )
 
-    def differences(own_m2: FloatArray) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]:
+    def differences(seen: _kernels.Ambiguous) -> _kernels.Differences:
         n = len(left)
-        count, value, cov = np.zeros(n, np.int64), np.zeros((n, size)), np.zeros((n, size, size))
-        row, column = np.zeros((n, size), np.int64), np.zeros((n, size), np.int64)
-        difference_many(
-            n, left, prediction.slope, prediction.cov, own_m2, common, clock_m2, wavelength_m, minus, reference,
-            count, value, cov, row, column,
-        )  # fmt: skip
-        return count, value, cov, row, column
+        out = _kernels.Differences(
+            n_sought=np.zeros(n, np.int64),
+            value=np.zeros((n, size)),
+            cov=np.zeros((n, size, size)),
+            row=np.zeros((n, size), np.int64),
+            column=np.zeros((n, size), np.int64),
+        )
+        _kernels.difference_many(n, seen, out)
+        return out
 
-    count, value, cov, row, column = differences(own + bend)
+    count, value, cov, row, column = differences(ranges._replace(own_m2=own + bend))
     found = integer_least_squares(value, cov, count=count, n_candidate=N_CANDIDATE)
     resolved = np.full((len(left), N_CANDIDATE, *left.shape[1:]), np.nan)
     # the references keep the integer that they have: clocks and transmitters take it up
@@ -164,7 +163,7 @@ def search_integers(
         resolved[m, :, r, i] = range_m[m, r, i][:, None] - found.integers[m, :, j] * wavelength_m[i][:, None]
     # a single observation that took no part in any difference is of no use
     resolved[count == 0] = np.nan
-    straight = integer_least_squares(value, differences(own)[2], count=count, n_candidate=1)
+    straight = integer_least_squares(value, differences(ranges).cov, count=count, n_candidate=1)
     return Candidates(
         range_m=resolved,
         squared_norm=found.squared_norm,

@@ -9,9 +9,9 @@ rotations from the best of many.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-from rfpose.checks import FloatArray, as_float_array
+from rfpose.checks import FloatArray
+from rfpose.multilat.rigid.problem import MirrorProblem
 
 __all__ = ["rotations_from_differences"]
 
@@ -26,32 +26,14 @@ _FLOOR = 1e-9
 """Of the information that nuisance unknowns have anyway, relative: their common constant is not seen."""
 
 
-def rotations_from_differences(
-    transmitter_enu_m: npt.ArrayLike,
-    receiver_mirror_m: npt.ArrayLike,
-    pivot_enu_m: npt.ArrayLike,
-    range_m: npt.ArrayLike,
-    *,
-    sigma_m: npt.ArrayLike,
-    clock_sigma_m: float = np.inf,
-) -> FloatArray:
+def rotations_from_differences(problem: MirrorProblem) -> FloatArray:
     """Orientations of mirrors at known places from ranges whose transmitters' own phases are unknown.
 
     Parameters
     ----------
-    transmitter_enu_m : (transmitter, xyz)
-        [m].
-    receiver_mirror_m : (mirror, receiver, xyz)
-        [m].
-    pivot_enu_m : (mirror, xyz)
-        [m].
-    range_m : (mirror, receiver, transmitter)
-        Ranges, each transmitter's up to a constant for all receivers, each receiver's up to one for all transmitters
-        [m]; NaN = not received.
-    sigma_m : (mirror, receiver, transmitter)
-        [m].
-    clock_sigma_m
-        Of the receivers' clocks about the mirror's common one [m].
+    problem
+        Begins at the known pivots. Of its first wavelength, whose ranges each have a constant for all receivers, each
+        transmitter's, and one for all transmitters, each receiver's.
 
     Returns
     -------
@@ -61,11 +43,8 @@ def rotations_from_differences(
     """
     from scipy.spatial.transform import Rotation
 
-    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    places = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
-    pivot = as_float_array("pivot_enu_m", pivot_enu_m, (len(places), 3))
-    z = as_float_array("range_m", range_m, (*places.shape[:2], len(transmitter)), finite=False)
-    sigma = np.broadcast_to(as_float_array("sigma_m", sigma_m, ("...",), finite=False), z.shape)
+    transmitter, places, pivot = problem.transmitter_enu_m, problem.receiver_mirror_m, problem.start_pivot_enu_m
+    z, sigma, clock_sigma_m = problem.range_m[:, 0], problem.sigma_m[:, 0], problem.knowledge.clock_sigma_m
     out = np.full((len(places), 3, 3), np.nan)
     trials = Rotation.random(_N_TRIAL, random_state=0).as_matrix()
     for begin in range(0, len(places), _ROWS):

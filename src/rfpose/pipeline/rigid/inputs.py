@@ -98,14 +98,7 @@ def problem_of(inputs: RigidInputs, group: MirrorGroup) -> MirrorProblem:
     known, weak = problem.knowledge, np.flatnonzero(_are_vague(inputs, group, places))
     if known.pivot_enu_m is not None and weak.size:
         pivot[weak] = known.pivot_enu_m[weak]
-        rot[weak] = rotations_from_differences(
-            problem.transmitter_enu_m,
-            places[weak],
-            pivot[weak],
-            problem.range_m[weak, 0],
-            sigma_m=problem.sigma_m[weak, 0],
-            clock_sigma_m=known.clock_sigma_m,
-        )
+        rot[weak] = rotations_from_differences(replace(problem, start_pivot_enu_m=pivot).take(weak))
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
 
