@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
@@ -80,8 +81,9 @@ def measure(rows: tuple[Any, ...], n_frame: int, *, seed: int = 7) -> dict[str, 
     for name, form in FORMS.items():
         known = {k: v for k, v in form.items() if k != "pose"}
         told = scenario.changed(heliostat=[h.model_dump(exclude_none=True) | known for h in scenario.heliostat])
-        settings = {**result.settings, "pose": str(form["pose"])}
-        out[name] = evaluate(solve(result.tones, told, settings=settings, truth=result.truth))
+        choice = choose(told, pose=str(form["pose"]))
+        how = {"sample_rate": result.sample_rate, "settings": result.settings, "truth": result.truth}
+        out[name] = evaluate(solve(result.tones, told, choice, **how))
     return out
 
 

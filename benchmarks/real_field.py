@@ -44,6 +44,7 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import RfposeError
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import Common
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.formats.antenna_file import read_pattern, write_pattern
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.mirrors import mirror_groups
@@ -608,9 +609,12 @@ def _normalised(off: Array, cov: Array, normal: Array) -> Array:
 
 def run(case: Case, pose: str) -> Row | str:
     """Solve a case; or say why that was refused."""
-    settings = {"sample_rate": str(case.scenario.radio.sample_rate), "estimator": "correlator", "pose": pose}
+    rate = case.scenario.radio.sample_rate
     try:
-        return row_of(case, solve(case.tones, case.scenario, settings=settings))
+        choice = choose(case.scenario, pose=pose)
+        return row_of(
+            case, solve(case.tones, case.scenario, choice, sample_rate=rate, settings={"estimator": "correlator"})
+        )
     except RfposeError as error:
         return str(error)
 

@@ -151,7 +151,15 @@ def test_calibration_receivers_each_have_a_reflection_of_their_own(far_apart: Re
         phase = np.array(tones.phase_rad)
         phase[0, -1], phase[1, -2:, 3], phase[2, -3:, 5] = np.nan, np.nan, np.nan
         tones = replace(tones, phase_rad=phase)
-    result = solve(tones, scenario, settings=far_apart.settings | {"reflection": model}, truth=far_apart.truth)
+    choice = replace(far_apart.choice, reflection=model)
+    result = solve(
+        tones,
+        scenario,
+        choice,
+        sample_rate=far_apart.sample_rate,
+        settings=far_apart.settings,
+        truth=far_apart.truth,
+    )
     found = evaluate(result)
     assert found.failed == 0
     # two angles a pose, twelve poses: 4.5 sigma

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import Common, Disturbance
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.layout import Rules, layout_map
 from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.site import SiteField, antenna_of, foreseen_mirrors, stray_ranges
@@ -113,8 +116,9 @@ def test_the_forecast_is_what_pose_site_states(ground: bool, plate: bool, snr_db
     scenario = site(ground=ground, plate=plate, snr_db=snr_db, floor=floor)
     found = layout_map(scenario, estimators=["site"])
     assert found.unsolved == ("",) * N_MIRROR
-    chosen = {"sample_rate": "64e6", "estimator": "correlator", "pose": "site"}
-    poses = [solve(measured(scenario, seed), scenario, settings=chosen).poses for seed in range(3)]
+    how = {"sample_rate": Fraction(64_000_000), "settings": {"estimator": "correlator"}}
+    chosen = choose(scenario, pose="site")
+    poses = [solve(measured(scenario, seed), scenario, chosen, **how).poses for seed in range(3)]
     assert (np.array([p.status for p in poses]) == PoseStatus.OK).all()
     ratio = 1e3 * np.array([p.sigma_rad[0] for p in poses]) / found.rms_mrad["site"]
     # a mirror's own residuals, some twenty degrees of freedom with heavy tails, make its sigma 0.15 smaller or larger

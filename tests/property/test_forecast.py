@@ -1,5 +1,6 @@
 """What a layout study forecasts of a scenario is what `rfpose process` states of phases that hold nothing but noise."""
 
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rfpose.measurement import SCENARIO
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.ground import Reflector, range_shift_m
 from rfpose.multilat.integrity import IntegrityStatus
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario
 from sites import TABLE_2
@@ -157,8 +159,8 @@ def test_the_forecast_is_what_process_states(ground: str, centre_hz: float, seed
     rng = np.random.default_rng(["none", "known", "estimated"].index(ground) + 10 * seed + 100 * (centre_hz == 0.0))
     scenario = drawn(rng, ground=ground, centre_hz=centre_hz)
     tones, mirrors = measured(scenario, rng), maps.mirrors_of(scenario)
-    chosen = {"sample_rate": "64e6", "estimator": "correlator"}
-    found = solve(tones, scenario, settings=chosen | {"pose": "rigid"})
+    how = {"sample_rate": Fraction(64_000_000), "settings": {"estimator": "correlator"}}
+    found = solve(tones, scenario, choose(scenario, pose="rigid"), **how)
     assert found.integrity is not None
     plan = working_point(scenario, mirrors)
     # a pose that rests on less than all phases states more
@@ -171,6 +173,6 @@ def test_the_forecast_is_what_process_states(ground: str, centre_hz: float, seed
         return
     np.testing.assert_allclose(maps.study_of(scenario, SCENARIO).bound(mirrors)[whole], stated, rtol=0.05)
     if scenario.calibration_receiver:
-        stated = solve(tones, scenario, settings=chosen | {"pose": "independent"}).poses.sigma_rad[0]
+        stated = solve(tones, scenario, choose(scenario, pose="independent"), **how).poses.sigma_rad[0]
         np.testing.assert_allclose(maps.study_of(scenario, "independent").bound(mirrors), stated, rtol=0.05)
         np.testing.assert_allclose(noise_bound(working_point(scenario, mirrors, pose="independent")), stated, rtol=0.05)

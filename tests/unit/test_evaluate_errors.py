@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.multilat import PoseStatus, joint_covariance, mirror_normal
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Statistics, evaluate, ratio_of, read_truth
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import write_result
@@ -51,8 +53,8 @@ def _exact_result() -> Result:
         frame_start_index=tones.frame_start_index,
         tone_snr=np.full((N_FRAME, 7, 10, 1), SNR),
     )
-    settings = {"sample_rate": "40000000", "estimator": "hilbert", "pose": "independent"}
-    return solve(tones, scenario, settings=settings, truth=truth)
+    choice, settings = choose(scenario, pose="independent"), {"estimator": "hilbert"}
+    return solve(tones, scenario, choice, sample_rate=Fraction(40_000_000), settings=settings, truth=truth)
 
 
 @pytest.fixture(scope="module")

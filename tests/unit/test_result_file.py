@@ -18,6 +18,7 @@ import pytest
 from rfpose.dsp import TonePhases
 from rfpose.errors import RecordingError
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
+from rfpose.pipeline.choice import choose
 from rfpose.pipeline.formats import result_file
 from rfpose.pipeline.formats.result import IntegrityTable, Result, frame_time
 from rfpose.pipeline.formats.result_file import KEYS, is_result, open_result, write_result
@@ -30,7 +31,7 @@ from rfpose.truth import Truth
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 START = 1_782_043_200 * 40_000_000
-SETTINGS = {"sample_rate": "40000000", "estimator": "hilbert", "pose": "independent", "version": "0"}
+SETTINGS = {"estimator": "hilbert", "version": "0"}
 
 
 def make_result(*, n_frame: int = 2, seed: int = 5) -> Result:
@@ -68,7 +69,8 @@ def make_result(*, n_frame: int = 2, seed: int = 5) -> Result:
         receiver_enu_m=place,
         frame_start_index=tones.frame_start_index,
     )
-    return solve(tones, scenario, settings=SETTINGS, truth=truth)
+    choice = choose(scenario, pose="independent")
+    return solve(tones, scenario, choice, sample_rate=Fraction(40_000_000), settings=SETTINGS, truth=truth)
 
 
 @pytest.fixture(scope="module")

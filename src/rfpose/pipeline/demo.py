@@ -142,6 +142,7 @@ def _run(
 ) -> tuple[Evaluation, Evaluation]:
     """Make all but the report; return the evaluations of all phases at once and of each receiver alone."""
     from rfpose.drawing import save_figure
+    from rfpose.pipeline.choice import choose
     from rfpose.pipeline.evaluate import evaluate
     from rfpose.pipeline.formats.result_summary import write_poses_csv
     from rfpose.pipeline.process import process
@@ -156,8 +157,15 @@ def _run(
     result = process(files["recording"], files["result"], on_progress=on_progress)
     tell(STAGES[2])
     evaluation = evaluate(result)
-    settings = {**result.settings, "pose": "independent"}
-    independent = evaluate(solve(result.tones, result.scenario, settings=settings, truth=result.truth))
+    again = solve(
+        result.tones,
+        result.scenario,
+        choose(result.scenario, pose="independent"),
+        sample_rate=result.sample_rate,
+        settings=result.settings,
+        truth=result.truth,
+    )
+    independent = evaluate(again)
     write_poses_csv(result, files["poses"])
     save_figure(result.plot(evaluation=evaluation), files["field_map"])
     with open_recording(files["recording"]) as recording:

@@ -16,7 +16,6 @@ from rfpose.foreign import load_json
 from rfpose.geometry import angle_between_rad, unit
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, position_bound
 from rfpose.pipeline.bound import normal_bound_rad
-from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.result_summary import count_reasons, left_out_of
@@ -398,7 +397,7 @@ def evaluate(
     located = (result.fixes.status == FixStatus.OK) & is_mirror
     normal_error = np.where(solved, angle_between_rad(result.poses.normal_enu, normal_true), np.nan)
     position_error = np.where(located, np.linalg.norm(result.fixes.position_enu_m - receiver_true, axis=-1), np.nan)
-    choice = PoseChoice.of(result.settings, result.scenario)
+    choice = result.choice
     # fading changes the power of each tone, which the truth's ratios (of direct rays) do not know
     noise = phase_noise(result, truth, rows, reported=choice.reflection != "none")
     bound = normal_bound_rad(
@@ -497,7 +496,7 @@ def _true_coefficient(result: Result) -> FloatArray | None:
     known = found[np.isfinite(found).all(axis=1)]
     value = np.median(known.real, axis=0) + 1j * np.median(known.imag, axis=0) if len(known) else 0.0 * found[0]
     ground = result.scenario.simulation.ground
-    if ground is not None and result.settings.get("reflection") in ("estimate", "known"):
+    if ground is not None and result.choice.reflection in ("estimate", "known"):
         value[0] = complex(*ground.coefficient)
     return np.asarray(value)
 

@@ -144,7 +144,8 @@ def process(
         with stages.during("poses"):
             if surveyed is not None:
                 tones = surveyed.without_delays(tones, site)
-            result = solve(tones, site, settings=settings, truth=truth, stages=stages)
+            rate = opened.sample_rate
+            result = solve(tones, site, choice, sample_rate=rate, settings=settings, truth=truth, stages=stages)
             if surveyed is not None:
                 result = surveyed.widened(result)
         stages.seconds["poses"] -= stages.seconds["calibration"]
@@ -229,9 +230,7 @@ def _settings(
         "command": command,
         "recording": recording.path.name,
         "recording_format": recording.format,
-        "sample_rate": str(recording.sample_rate),
         "scenario_from": "recording" if given is None else "caller" if isinstance(given, Scenario) else "file",
         "estimator": estimator,
-        **choice.as_settings(),
         "delays": "learned" if learns else "as the scenario says",
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +27,7 @@ from rfpose.multilat import (
 )
 from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, choose
-from rfpose.pipeline.formats.result import FixTable, PoseTable, Result, rate_of
+from rfpose.pipeline.formats.result import FixTable, PoseTable, Result
 from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
 from rfpose.pipeline.stages import Stopwatch
@@ -119,7 +120,9 @@ def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> No
 def solve(
     tones: TonePhases,
     scenario: Scenario,
+    choice: PoseChoice,
     *,
+    sample_rate: Fraction,
     settings: Mapping[str, str],
     truth: Truth | None = None,
     stages: Stopwatch | None = None,
@@ -132,9 +135,12 @@ def solve(
         Along the scenario's receiver axis.
     scenario
         The site.
+    choice
+        The estimator of poses.
+    sample_rate
+        Of the recording [1/s].
     settings
-        Kept with the result; must hold ``sample_rate``, ``estimator`` and ``pose``. ``reflection``, ``integrity``
-        and ``filter`` choose the estimator of poses; without them the scenario does.
+        What else the result depends on, kept with it; must hold ``estimator``, that of the tones.
     truth
         Kept with the result.
     stages
@@ -145,8 +151,7 @@ def solve(
     InvalidInputError, ScenarioError, GeometryError
         As `check_solvable`. A receiver or mirror that cannot be solved is NaN with a status.
     """
-    choice = PoseChoice.of(settings, scenario)
-    check_solvable(scenario, pose=settings["pose"], choice=choice)
+    check_solvable(scenario, pose=choice.pose, choice=choice)
     with contextlib.nullcontext() if stages is None else stages.during("calibration"):
         calibration = calibrate(tones, scenario) if is_calibrated(scenario) else _no_calibration(tones)
     ranges = _ranges(tones, calibration, scenario) if is_calibrated(scenario) else _no_ranges(tones)
@@ -168,9 +173,7 @@ def solve(
     if choice.pose == "site":
         from rfpose.pipeline.site import solve_site_poses  # propagation, which other poses do without
 
-        found = solve_site_poses(
-            tones, scenario, independent, sample_rate=rate_of(settings), simulated=truth is not None
-        )
+        found = solve_site_poses(tones, scenario, independent, sample_rate=sample_rate, simulated=truth is not None)
     elif choice.pose == "rigid":
         found = solve_rigid_poses(
             tones,
@@ -180,11 +183,13 @@ def solve(
             independent,
             scenario,
             choice,
-            sample_rate=rate_of(settings),
+            sample_rate=sample_rate,
         )
     result = Result(
         scenario=scenario,
-        settings=settings,
+        sample_rate=sample_rate,
+        choice=choice,
+        settings={**settings, "sample_rate": str(sample_rate), **choice.as_settings()},
         frame_start_index=tones.frame_start_index,
         tones=tones,
         calibration=calibration,

@@ -18,6 +18,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.foreign import exact_number
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.integrity import IntegrityStatus
+from rfpose.pipeline.choice import PoseChoice
 from rfpose.scenario import Scenario
 from rfpose.shown import Shown, counted, number
 from rfpose.tables import data_frame
@@ -280,8 +281,12 @@ class Result(Shown):
     ----------
     scenario
         The site as it was processed; its receiver axis is the receiver axis here.
+    sample_rate
+        Nominal, of the recording [1/s].
+    choice
+        The estimator of poses.
     settings
-        What the result depends on besides the recording, as text.
+        All that the result depends on besides the recording, these two too, as text for the file.
     frame_start_index : (frame,)
         First sample of each frame, counted from the Unix epoch at the recording's sample rate.
     tones, calibration, ranges, fixes, poses
@@ -296,6 +301,8 @@ class Result(Shown):
     """
 
     scenario: Scenario
+    sample_rate: Fraction
+    choice: PoseChoice
     settings: Mapping[str, str]
     frame_start_index: npt.NDArray[np.int64]
     tones: TonePhases
@@ -310,11 +317,6 @@ class Result(Shown):
     filtered: FilteredTable | None = None
     truth: Truth | None = None
     profile: Mapping[str, Any] | None = None
-
-    @property
-    def sample_rate(self) -> Fraction:
-        """Nominal sample rate [1/s]."""
-        return rate_of(self.settings)
 
     def headline(self) -> str:
         """Return of what, how much, and how many poses were solved."""

@@ -321,11 +321,13 @@ class _Reader(FileReader):
             "heliostat": len(scenario.heliostat_ids),
             "ray_kind": len(RayKind),
         }
-        settings = self._settings(scenario)
-        start_index = self._start_index(Fraction(settings["sample_rate"]))
+        settings, sample_rate, choice = self._settings(scenario)
+        start_index = self._start_index(sample_rate)
         tones = self._group("tones")
         return Result(
             scenario=scenario,
+            sample_rate=sample_rate,
+            choice=choice,
             settings=settings,
             frame_start_index=start_index,
             tones=TonePhases(
@@ -343,7 +345,7 @@ class _Reader(FileReader):
             truth=self._truth(scenario),
         )
 
-    def _settings(self, scenario: Scenario) -> dict[str, str]:
+    def _settings(self, scenario: Scenario) -> tuple[dict[str, str], Fraction, PoseChoice]:
         group = find_item(self.file, "/settings", follow_links=False)
         found = dict(group.attrs.items()) if isinstance(group, h5py.Group) else {}
         for name, value in found.items():
@@ -353,11 +355,9 @@ class _Reader(FileReader):
             if name not in found:
                 raise self.error("settings", f"is missing or lacks `{name}`")
         try:
-            rate_of(found)
-            PoseChoice.of(found, scenario)
+            return found, rate_of(found), PoseChoice.of(found, scenario)
         except RfposeError as error:
             raise self.error("settings", f"cannot be: {error}") from error
-        return found
 
     def _start_index(self, sample_rate: Fraction) -> npt.NDArray[np.int64]:
         starts = self._array("frames/start_index")

@@ -70,14 +70,14 @@ def summarise(result: Result) -> dict[str, Any]:
         "heliostats": len(result.scenario.heliostat_ids),
         "receivers": len(result.scenario.receiver_ids),
         "estimator": result.settings["estimator"],
-        "pose": result.settings["pose"],
+        "pose": result.choice.pose,
     }
     for name, (status, codes) in parts.items():
         solved = int(np.count_nonzero(status == 0))
         summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
-    choice = {"reflection": "none", "integrity": "off", "delays": "as the scenario says", "filter": "off"}
-    summary["choice"] = {name: result.settings.get(name, default) for name, default in choice.items()}
-    if result.settings["pose"] == "rigid":
+    choice = {"delays": "as the scenario says", **result.settings, **result.choice.as_settings()}
+    summary["choice"] = {name: choice[name] for name in ("reflection", "integrity", "delays", "filter")}
+    if result.choice.pose == "rigid":
         summary["integers"] = _summary_of_integers(result)
     if result.integrity is not None:
         summary["integrity"] = _summary_of_integrity(result, result.integrity)

@@ -190,7 +190,7 @@ def _budget(file: Opened, _: FigureChoice) -> Figure:
     from rfpose.pipeline.layout import budget
 
     assert file.scenario is not None
-    pose = "rigid" if file.result is None else file.result.settings.get("pose", "rigid")
+    pose = "rigid" if file.result is None else file.result.choice.pose
     if pose == "site":
         raise InvalidInputError("pose `site` has no error budget; draw `map` or `errors`")
     return budget(file.scenario, pose=pose, n_draw=0).plot()
@@ -208,10 +208,9 @@ def _estimator(result: Result | None) -> str:
     """Return the estimator of `rfpose layout map` that a result was made with."""
     if result is None:
         return "scenario"
-    pose, reflection = result.settings.get("pose", "rigid"), result.settings.get("reflection", "none")
-    if pose == "rigid":
-        return "reflection" if reflection == "estimate" else "scenario"
-    return pose
+    if result.choice.pose == "rigid":
+        return "reflection" if result.choice.reflection == "estimate" else "scenario"
+    return result.choice.pose
 
 
 def _course(file: Opened, _: FigureChoice) -> Figure:

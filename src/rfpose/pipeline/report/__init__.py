@@ -99,7 +99,7 @@ def _figures(file: Opened, choice: ReportChoice) -> list[tuple[str, FigureChoice
         found += [("map", FigureChoice(frame=k), f"The field in frame {k + 1}; colours: {of}.") for k in choice.frames]
         found.append(("errors", FigureChoice(), "How good the normals are, by mirror and over the frames."))
         found.append(("links", FigureChoice(), "What became of each transmitter at the mirrors' receivers."))
-        if file.result.settings.get("pose") != "site":
+        if file.result.choice.pose != "site":
             text = (
                 "Where errors come from, by the scenario's [budget], to first order: what this recording cannot show."
             )
