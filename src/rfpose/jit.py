@@ -36,7 +36,7 @@ Function = Callable[..., Any]
 
 # Reordering and contraction let sums vectorise. "nnan" and "ninf" stay off: NaN is a mark here.
 _REORDER = {"reassoc", "contract", "arcp", "nsz"}
-_COMMON: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+_COMMON: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 _log = logging.getLogger(__name__)
 
@@ -195,6 +195,24 @@ def load_numba() -> Any:
     return numba
 
 
+@functools.cache
+def _light_cache() -> Any:
+    """Return a cache of compiled kernels that readies for compiling only when something is compiled.
+
+    Numba's own loads all that its compiler knows about Python and numpy, 0.2 s, before it looks into the cache.
+    """
+    from numba.core.caching import FunctionCache
+    from numba.core.runtime.nrt import rtsys
+
+    class LightCache(FunctionCache):
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            rtsys.initialize(target_context)
+            with self._guard_against_spurious_io_errors():
+                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    return LightCache
+
+
 def _take_scipy_as_there() -> None:
     """Spare numba the loading of `scipy.linalg`, half a second, by which it only learns that scipy is installed.
 
@@ -212,14 +230,15 @@ def _take_scipy_as_there() -> None:
 
 def _compiled(numba: Any, function: Function, options: dict[str, Any]) -> Function:
     """Hand a function to numba, with its cache if there is a place for it."""
+    dispatcher = numba.njit(**_COMMON, **options)(function)
     try:
-        return numba.njit(**_COMMON, **options)(function)  # type: ignore[no-any-return]
+        dispatcher._cache = _light_cache()(function)
     except RuntimeError as error:
         if "cache" not in str(error):
             raise
-    # neither the package's directory nor the user's may be written
-    _teller.can_keep = False
-    return numba.njit(**_COMMON | {"cache": False}, **options)(function)  # type: ignore[no-any-return]
+        # neither the package's directory nor the user's may be written
+        _teller.can_keep = False
+    return dispatcher  # type: ignore[no-any-return]
 
 
 class _Teller:

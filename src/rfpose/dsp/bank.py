@@ -157,6 +157,8 @@ class LineBank:
     clock
         What is known of the receiver's clock; the more, the longer are the flat blocks and the less is left to do after
         them. None: nothing yet.
+    n_tap
+        Length of Hann windows [samples], about; None: the longer the better that a frame has room for.
     full_scale
         Component magnitude at which a sample counts as clipped [counts].
     """
@@ -168,13 +170,19 @@ class LineBank:
         *,
         windowed: bool,
         clock: ClockRange | None = None,
+        n_tap: int | None = None,
         full_scale: float = np.inf,
     ) -> None:
         self.plan = plan
         self.n_sample = n_sample
         self.full_scale = float(full_scale)
-        n_tap = _window_length(plan, n_sample) if windowed else _block_length(plan, n_sample, clock)
-        self.window = _window(plan, n_tap) if windowed else BOXCAR
+        self.window: tuple[float, ...] = HANN
+        if not windowed:
+            n_tap, self.window = _block_length(plan, n_sample, clock), BOXCAR
+        elif n_tap is None:
+            n_tap = _window_length(plan, n_sample)
+            self.window = _window(plan, n_tap)
+        n_tap = min(n_tap, n_sample // 2)
         overlap = _OVERLAP[self.window]
         self.period, self.n_fold = _folding(plan.grid, n_tap, overlap)
         self.n_tap = self.period * self.n_fold

@@ -8,41 +8,72 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels
-from rfpose.dsp.bank import LineStreams
+from rfpose.dsp.bank import LineBank, LineStreams
 from rfpose.dsp.plan import LinePlan
 
-__all__ = ["coarse_clock_ppm", "refine_clock"]
+__all__ = ["SEARCH_SAMPLES", "coarse_clock_ppm", "refine_clock", "search_bank"]
 
-_SEARCH_SAMPLES = 2**17
+ComplexArray = npt.NDArray[np.complex128] | npt.NDArray[np.complex64]
+Samples = npt.NDArray[np.int16] | npt.NDArray[np.float32]
+
+SEARCH_SAMPLES = 2**17
+_FEWEST_BLOCKS = 32
 
 
-def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], plan: LinePlan) -> float:
+def coarse_clock_ppm(samples: npt.NDArray[np.int16] | npt.NDArray[np.float32], plan: LinePlan, bank: LineBank) -> float:
     """Find the clock offset that puts most power under the plan's lines, from one spectrum.
 
     Parameters
     ----------
     samples : (sample, 2)
-        I and Q; at most the first 131 072 samples are used.
+        I and Q; at most the first `SEARCH_SAMPLES` are used.
     plan
         Lines and the range to search.
+    bank
+        As `search_bank` makes it for as many samples.
 
     Returns
     -------
     Offset [ppm], good to a fraction of a bin of that spectrum.
     """
-    part = samples[:_SEARCH_SAMPLES]
+    part = samples[:SEARCH_SAMPLES]
+    widest = float(np.max(np.abs(plan.cycles_per_ppm())))
+    step = 0.25 / (len(part) * widest)
+    n_side = int(np.ceil(plan.clock_search_ppm / step))
+    candidate: FloatArray = step * np.arange(-n_side, n_side + 1, dtype=np.float64)
+    cycles = plan.line_cycles(candidate[:, None])
+    spectrum_at = _whole_spectrum if bank.n_block < _FEWEST_BLOCKS else _spectra_of_lines
+    under = spectrum_at(part, bank, cycles)
+    score = (under.real.astype(np.float64) ** 2 + under.imag.astype(np.float64) ** 2).sum(axis=1)
+    return float(candidate[int(np.argmax(score))])
+
+
+def search_bank(plan: LinePlan, n_sample: int) -> LineBank:
+    """Return the bank whose filters are so wide that a line stays in its own wherever the clock may be."""
+    turns = plan.clock_search_ppm * float(np.max(np.abs(plan.cycles_per_ppm())))
+    n_tap = max(2, int(0.4 / max(turns, 1e-9)))
+    if plan.grid is not None and n_tap > 2 * plan.grid:
+        n_tap -= n_tap % (2 * plan.grid)  # halves of whole rows are folded in one pass
+    return LineBank(plan, min(n_sample, SEARCH_SAMPLES), windowed=True, n_tap=n_tap)
+
+
+def _spectra_of_lines(part: Samples, bank: LineBank, cycles: FloatArray) -> ComplexArray:
+    """(candidate, line) spectrum at the cycles a sample asked for, from few values of each line over time."""
+    streams = bank.streams(part, 0.0)
+    n_fft = 2 << (streams.n_block - 1).bit_length()
+    spectrum = np.fft.fft(streams.stream * _hanning(streams.n_block), n_fft)
+    bins = np.rint((cycles - streams.cycles) * (streams.hop * n_fft)).astype(np.int64) % n_fft
+    return np.asarray(np.take_along_axis(spectrum, bins.T, 1).T)
+
+
+def _whole_spectrum(part: Samples, bank: LineBank, cycles: FloatArray) -> ComplexArray:
+    """Like `_spectra_of_lines`, from all samples at once: for short frames, and where lines may be anywhere."""
     n_fft = 2 * len(part)
     signal = np.ascontiguousarray(part, np.float32).view(np.complex64)[:, 0]
     spectrum = np.fft.fft(signal * _hanning(len(part)), n_fft)
-    widest = float(np.max(np.abs(plan.cycles_per_ppm())))
-    step = 0.5 / (n_fft * widest)
-    n_side = int(np.ceil(plan.clock_search_ppm / step))
-    candidate = step * np.arange(-n_side, n_side + 1)
-    cycles = np.array([plan.line_cycles(float(ppm)) for ppm in candidate])
-    under = spectrum[np.rint(cycles * n_fft).astype(np.int64) % n_fft]
-    score = (under.real.astype(np.float64) ** 2 + under.imag.astype(np.float64) ** 2).sum(axis=1)
-    return float(candidate[int(np.argmax(score))])
+    return np.asarray(spectrum[np.rint(cycles * n_fft).astype(np.int64) % n_fft])
 
 
 @lru_cache(maxsize=4)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels, hilbert
 from rfpose.dsp.bank import ClockRange, Inspection, LineBank, LineStreams, inspect
-from rfpose.dsp.clock import coarse_clock_ppm, refine_clock
+from rfpose.dsp.clock import SEARCH_SAMPLES, coarse_clock_ppm, refine_clock, search_bank
 from rfpose.dsp.correlator import JointFit
 from rfpose.dsp.plan import LinePlan
 from rfpose.dsp.tones import FrameTones, LineStatus
@@ -67,6 +67,7 @@ class ToneExtractor:
         self.full_scale = float(full_scale)
         self._bank = lru_cache(maxsize=16)(self._make_bank)
         self._search_bank = lru_cache(maxsize=4)(self._make_search_bank)
+        self._wide_bank = lru_cache(maxsize=4)(lambda n_sample: search_bank(plan, n_sample))
         self._fit = lru_cache(maxsize=16)(JointFit)
         self._drift_ppm = min(_CLOCK_DRIFT_PPM, plan.clock_search_ppm)
 
@@ -97,8 +98,8 @@ class ToneExtractor:
         x = _as_samples(samples)
         if _fault(inspect(x, self.full_scale), len(x)) is not LineStatus.OK:
             return np.nan
-        coarse = coarse_clock_ppm(x, self.plan)
-        bin_ppm = 1.0 / (min(len(x), 2**17) * float(np.max(np.abs(self.plan.cycles_per_ppm()))))
+        coarse = coarse_clock_ppm(x, self.plan, self._wide_bank(len(x)))
+        bin_ppm = 1.0 / (min(len(x), SEARCH_SAMPLES) * float(np.max(np.abs(self.plan.cycles_per_ppm()))))
         streams = self._search_bank(len(x)).streams(x, coarse)
         return refine_clock(streams, self.plan, min(bin_ppm, self.plan.clock_search_ppm))[0]
 

@@ -116,8 +116,10 @@ class LinePlan:
         """Smallest distance between two lines [Hz]."""
         return float(np.min(np.diff(np.sort(self.line_hz))))
 
-    def line_cycles(self, clock_ppm: float) -> FloatArray:
+    def line_cycles(self, clock_ppm: float | FloatArray) -> FloatArray:
         """(line,) line frequencies as a receiver with this clock offset records them [cycles/sample].
+
+        Of several offsets (candidate, 1): (candidate, line).
 
         One oscillator drives mixer and sampler: with ``k = 1 + clock_ppm·1e-6`` a line at RF ``f`` appears at
         ``(f − k f_c) / (k f_s)``.

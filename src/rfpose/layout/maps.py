@@ -510,23 +510,38 @@ def in_words(estimator: Estimator, propagation_speed_mps: float) -> str:
 
 def check_clear(scenario: Scenario) -> None:
     """Refuse a scenario without heliostats, or with one on top of another or of a transmitter."""
-    from scipy.spatial import KDTree
-
     if not scenario.heliostat:
         raise GeometryError("the scenario has no heliostats; add some, or a field from CSV")
-    tree = KDTree(scenario.pivot_enu_m)
-    pairs = sorted(tree.query_pairs(_COINCIDENT_M))
-    if pairs:
-        i, j = pairs[0]
+    pivot = scenario.pivot_enu_m
+    pair = _coincident(pivot)
+    if pair is not None:
+        i, j = pair
         ids = scenario.heliostat_ids
         raise GeometryError(f"heliostats `{ids[i]}` and `{ids[j]}` stand at the same place; move or remove one")
-    distance, nearest = (np.asarray(a) for a in tree.query(scenario.transmitter_enu_m))
-    if distance.min() < _COINCIDENT_M:
-        t = int(np.argmin(distance))
-        raise GeometryError(
-            f"heliostat `{scenario.heliostat_ids[nearest[t]]}` and transmitter `{scenario.transmitter_ids[t]}` stand "
-            "at the same place; move one"
-        )
+    for transmitter_id, place in zip(scenario.transmitter_ids, scenario.transmitter_enu_m, strict=True):
+        distance = np.linalg.norm(pivot - place, axis=1)
+        nearest = int(np.argmin(distance))
+        if distance[nearest] < _COINCIDENT_M:
+            raise GeometryError(
+                f"heliostat `{scenario.heliostat_ids[nearest]}` and transmitter `{transmitter_id}` stand at the same "
+                "place; move one"
+            )
+
+
+def _coincident(place: FloatArray) -> tuple[int, int] | None:
+    """Return two places that are the same, or None."""
+    order = np.argsort(place[:, 0], kind="stable")
+    sorted_place = place[order]
+    # whoever is as near to the east stands behind in the order; the more stand beside each other, the further
+    for behind in range(1, len(place)):
+        step = sorted_place[behind:] - sorted_place[:-behind]
+        if step[:, 0].min() > _COINCIDENT_M:
+            return None
+        same = np.flatnonzero(np.einsum("ni,ni->n", step, step) <= _COINCIDENT_M**2)
+        if same.size:
+            i, j = sorted((int(order[same[0]]), int(order[same[0] + behind])))
+            return i, j
+    return None
 
 
 def summarise(values: FloatArray) -> dict[str, float]:

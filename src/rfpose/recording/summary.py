@@ -239,21 +239,22 @@ def _describe_receiver(
         return entry
     sample = _look_at(recording, receiver_id)
     n_fill = count_fill(sample)
-    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is counted, not warned of
-        values = sample.astype(np.float64)
-    bad = ~np.isfinite(values)
-    magnitude = np.abs(values[~bad])
     full_scale = recording.full_scale
-    rms = float(np.sqrt(np.mean(np.square(magnitude)))) if magnitude.size else 0.0
-    clipped = float(np.mean(magnitude >= full_scale)) if magnitude.size else 0.0
+    is_float = sample.dtype.kind == "f"
+    with np.errstate(invalid="ignore", over="ignore"):  # what is no number is counted, not warned of
+        values = sample.astype(np.float64).ravel()
+    finite = values[np.isfinite(values)] if is_float else values
+    peak = max(float(finite.max()), -float(finite.min())) if finite.size else 0.0
+    rms = math.sqrt(np.einsum("i,i", finite, finite) / finite.size) if finite.size else 0.0
+    clipped = float(np.mean(np.abs(finite) >= full_scale)) if peak >= full_scale else 0.0
     entry |= {
         "looked_at": len(sample),
         "rms": rms,
-        "peak": float(magnitude.max()) if magnitude.size else 0.0,
+        "peak": peak,
         "rms_dbfs": 20.0 * math.log10(rms / full_scale) if rms > 0.0 and math.isfinite(full_scale) else None,
         "clipped_fraction": clipped,
         "fill_samples": n_fill,
-        "non_finite_values": int(bad.sum()) - (2 * n_fill if sample.dtype.kind == "f" else 0),
+        "non_finite_values": values.size - finite.size - (2 * n_fill if is_float else 0),
     }
     if n_fill:
         problems.of(receiver_id, f"{n_fill} of {len(sample)} samples looked at hold the fill value: lost samples")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rfpose.dsp import ESTIMATORS, LinePlan, LineStatus, ToneExtractor
+from rfpose.dsp.clock import SEARCH_SAMPLES, coarse_clock_ppm, search_bank
 from rfpose.errors import InvalidInputError
 
 CARRIER = np.array([-18e6, -6e6, 2e6, 14e6])
@@ -57,6 +58,16 @@ def test_a_clock_that_jumped_is_found_again(plan, frame):
     assert found.clock_ppm == pytest.approx(31.0, abs=0.1)
     error = np.angle(np.exp(1j * (differences(found.phase_rad) - differences(phase))))
     assert np.all(np.abs(error) < 6 * np.sqrt(2) * found.sigma_rad)
+
+
+@pytest.mark.parametrize("n_sample", [400, 3000, 16384, 200_000])
+@pytest.mark.parametrize("clock_ppm", [-49.5, -20.3, 0.0, 7.7, 49.5])
+def test_a_clock_is_found_over_the_whole_search_range(plan, frame, n_sample, clock_ppm):
+    samples, _, _ = frame(n_sample, clock_ppm=clock_ppm)
+    found = coarse_clock_ppm(samples, plan, search_bank(plan, n_sample))
+    # the nearest candidate or the one beside it: they lie a quarter of the spectrum's bin apart
+    bin_ppm = 1.0 / (min(n_sample, SEARCH_SAMPLES) * np.abs(plan.cycles_per_ppm()).max())
+    assert found == pytest.approx(clock_ppm, abs=0.5 * bin_ppm)
 
 
 @pytest.mark.parametrize("estimator", ["hilbert", "correlator"])
