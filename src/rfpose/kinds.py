@@ -11,6 +11,7 @@ __all__ = ["FORMAT_KINDS", "check_kind", "is_hdf5", "kind_of", "told_kind"]
 
 FORMAT_KINDS = {
     "rfpose-iq": "recording",
+    "rfpose-recording": "recording",
     "rfpose-result": "result",
     "rfpose-tracking": "track",
     "rfpose-mount": "model",

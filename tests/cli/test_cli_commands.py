@@ -20,7 +20,7 @@ from rfpose.pipeline.demo import run_demo, shipped_scenario
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result_file import open_result
 from rfpose.recording import open_recording
-from rfpose.recording.base import RecordingFormat
+from rfpose.recording.base import WrittenFormat
 from rfpose.scenario import Scenario, load_scenario
 from told import undocumented, unseen
 
@@ -118,7 +118,7 @@ def test_convert_there_and_back(directory: Path, tmp_path: Path) -> None:
 
 
 def test_format_names_are_those_of_recording() -> None:
-    assert set(FORMAT_NAMES) == set(get_args(RecordingFormat))
+    assert set(FORMAT_NAMES) == set(get_args(WrittenFormat))
 
 
 @pytest.mark.parametrize(

@@ -311,10 +311,12 @@ def test_sigmf_annotations_and_undeclared_extensions_are_no_faults(tmp_path):
             {"captures": [{"core:sample_start": 0, "core:global_index": 2**63 - 1}]},
             "must be a whole number below 9223[0-9]{15}",
         ),
-        ({"datatype": "cu8"}, "`core:datatype` is cu8; rfpose reads ci16 and cf32"),
-        ({"core:offset": 100}, "`core:offset` is not supported"),
-        ({"core:num_channels": 2}, "interleaved channels"),
-        ({"captures": [{"core:sample_start": 0, "core:header_bytes": 4}]}, "headers within the samples"),
+        ({"datatype": "ri16_le"}, "`core:datatype` is ri16_le; .* must be one of ci8, cu8, ci16_le"),
+        ({"datatype": "cf64_le"}, "`core:datatype` is cf64_le; .* must be one of ci8, cu8, ci16_le"),
+        (
+            {"core:offset": 100, "captures": [{"core:sample_start": 0}]},
+            "capture 0 has a `core:sample_start` before `core:offset`, 100",
+        ),
         ({"captures": [{"core:sample_start": 5000}]}, "capture 0 starts at sample 5000 of 1000.*truncated"),
         (
             {"captures": [{"core:sample_start": 0, "core:global_index": 50},
@@ -362,9 +364,79 @@ def test_sigmf_receivers_that_differ(tmp_path):
         open_recording(tmp_path / "s")
 
 
-def test_sigmf_archive_is_named(tmp_path):
+STORED = {
+    "ci8": ("i1", 0, "int16"), "cu8": ("u1", 128, "int16"), "ci16_le": ("<i2", 0, "int16"),
+    "ci16_be": (">i2", 0, "int16"), "ci32_le": ("<i4", 0, "complex64"), "ci32_be": (">i4", 0, "complex64"),
+    "cf32_le": ("<f4", 0, "complex64"), "cf32_be": (">f4", 0, "complex64"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("datatype", STORED)
+@pytest.mark.parametrize("channels", [1, 3])
+def test_sigmf_types_channels_headers_and_trailer(tmp_path, datatype, channels):
+    """A non-conforming dataset of every type; the values are small enough to be exact in all."""
+    dtype, zero, sample_format = STORED[datatype]
+    values = np.random.default_rng(5).integers(-100, 100, size=(700, channels, 2))
+    stored = (values + zero).astype(dtype)
+    tmp_path.joinpath("x.bin").write_bytes(
+        b"head" + stored[:300].tobytes() + b"pause" + stored[300:].tobytes() + b"tail!"
+    )
+    meta = {
+        "global": {
+            "core:datatype": datatype, "core:sample_rate": 1e6, "core:version": "1.2.0", "core:num_channels": channels,
+            "core:dataset": "x.bin", "core:trailing_bytes": 5, "core:offset": 50,
+        },
+        "captures": [
+            {"core:sample_start": 50, "core:global_index": EPOCH, "core:header_bytes": 4},
+            {"core:sample_start": 350, "core:global_index": EPOCH + 1000, "core:header_bytes": 5},
+        ],
+        "annotations": [],
+    }  # fmt: skip
+    tmp_path.joinpath("x.sigmf-meta").write_text(json.dumps(meta))
+    with open_recording(tmp_path / "x.sigmf-meta") as r:
+        assert r.receiver_ids == (("x",) if channels == 1 else tuple(f"x_r{k}" for k in range(channels)))
+        assert r.sample_format == sample_format
+        for k, name in enumerate(r.receiver_ids):
+            assert r.blocks(name).tolist() == [[EPOCH, 300], [EPOCH + 1000, 400]]
+            assert np.array_equal(r.read(name, EPOCH, 300), values[:300, k])
+            assert np.array_equal(r.read(name, EPOCH + 1007, 200), values[307:507, k])
+    with (tmp_path / "x.bin").open("ab") as file:
+        file.write(b"x")
+    with pytest.raises(RecordingError, match="integer number of samples"):
+        open_recording(tmp_path / "x.sigmf-meta")
+
+
+def test_sigmf_archive_and_collection_of_the_library(tmp_path, monkeypatch):
+    x = {name: counts(1000, seed) for seed, name in enumerate(("r0", "r1"))}
+    stamp = {"core:sample_start": 0, "core:global_index": EPOCH}
+    for name, samples in x.items():
+        write_sigmf(tmp_path, name, samples, [stamp])
+    monkeypatch.chdir(tmp_path)
+    sigmf.SigMFCollection(["r0.sigmf-meta", "r1.sigmf-meta"]).tofile("both")
+    sigmf.fromfile("r0.sigmf-meta").archive("packed")
+    sigmf.fromfile("r0.sigmf-meta").archive("packed.sigmf.gz", compression="gz")
+    with open_recording(tmp_path / "packed.sigmf") as r:
+        assert r.receiver_ids == ("r0",) or r.receiver_ids == ("packed",)
+        assert np.array_equal(r.read(r.receiver_ids[0], EPOCH + 5, 900), x["r0"][5:905])
+        assert tmp_path / "packed.sigmf" in r.files()
+    with pytest.raises(RecordingError, match="compressed SigMF archive; unpack it"):
+        open_recording(tmp_path / "packed.sigmf.gz")
+    with open_recording(tmp_path / "both.sigmf-collection") as r:
+        assert r.receiver_ids == ("r0", "r1")
+        assert np.array_equal(r.read("r1", EPOCH, 1000), x["r1"])
+        assert r.notes == []
+    meta = tmp_path / "r0.sigmf-meta"
+    meta.write_text(meta.read_text().replace("1.2.0", "1.2.1"))
+    (tmp_path / "r1.sigmf-meta").unlink()
+    with open_recording(tmp_path / "both.sigmf-collection") as r:
+        assert r.receiver_ids == ("r0",)
+        assert "`r0.sigmf-meta` was changed since `both.sigmf-collection` was written" in r.notes[0]
+        assert "names `r1.sigmf-meta`, which is missing" in r.notes[1]
+
+
+def test_sigmf_archive_that_is_none(tmp_path):
     (tmp_path / "a.sigmf").write_bytes(b"x")
-    with pytest.raises(RecordingError, match="unpack it"):
+    with pytest.raises(RecordingError, match="no sound uncompressed archive"):
         open_recording(tmp_path / "a.sigmf")
 
 

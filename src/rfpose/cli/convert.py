@@ -32,7 +32,7 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
         "rfpose convert recording.h5 -o measured/drf --to digital-rf",
     ),
 )
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File or directory to make.")
 @click.option(
     "--to", "format_name", type=click.Choice(FORMAT_NAMES), default="rfpose-iq", show_default=True, help="Format."
@@ -42,11 +42,11 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
 @force_option
 @common_options
 def command(
-    recording: Path, output: Path, format_name: Any, scenario: Path | None, follow_links: bool, force: bool
+    recording: tuple[Path, ...], output: Path, format_name: Any, scenario: Path | None, follow_links: bool, force: bool
 ) -> None:
     """Write a recording in another format; samples, times and gaps stay exactly as they are."""
     directories = format_name != FORMAT_NAMES[0]
-    claimed = outputs(output, inputs=[recording, scenario], force=force, directories=directories)
+    claimed = outputs(output, inputs=[*recording, scenario], force=force, directories=directories)
     with claimed, progress("Converting") as on_progress:
         from rfpose.recording import convert, open_recording
         from rfpose.scenario import load_scenario

@@ -18,14 +18,18 @@ from rfpose.cli._support import (
     force_option,
     outputs,
     say,
+    table,
     wants_json,
 )
 from rfpose.errors import InvalidInputError
+from rfpose.kinds import kind_of
 
 __all__ = ["command"]
 
 _MANY = ("receivers",)
 """Tables of what is usually alike."""
+_MANY_RECEIVERS = 5
+"""So many are counted, not named."""
 _EACH = 20
 """Of other tables so many rows are printed each for itself."""
 
@@ -39,49 +43,84 @@ _EACH = 20
         "rfpose info site.toml --picture site.png",
         "rfpose info models.json",
         "rfpose info day.h5",
+        "rfpose info night/*.h5 cal0/ --picture coverage.svg",
     ),
 )
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw a scenario's site: .png, .svg, .pdf.")
+@click.argument("file", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--picture", type=click.Path(path_type=Path), help="Draw a scenario's site, or who recorded when: .png, .svg, .pdf."
+)
 @follow_links_option
 @force_option
 @common_options
-def command(file: Path, picture: Path | None, follow_links: bool, force: bool) -> None:
+def command(file: tuple[Path, ...], picture: Path | None, follow_links: bool, force: bool) -> None:
     """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound.
 
-    Of a scenario also draw the site, in letters or with --picture.
+    Several files are the parts of one recording. Of a scenario also draw the site, in letters or with --picture; of a
+    recording --picture draws who recorded when.
     """
     check_ending(picture, ".png", ".svg", ".pdf")
-    check_there(file)
+    given: Path | tuple[Path, ...] = file[0] if len(file) == 1 else file
+    if isinstance(given, Path):
+        check_there(given)
     from rfpose.pipeline.inspect import inspect_file
 
-    found = inspect_file(file, follow_links=follow_links)
+    found = inspect_file(given, follow_links=follow_links)
     is_site = found["kind"] == "scenario"
     if picture is not None:
-        if not is_site:
-            raise InvalidInputError(f"`picture` draws a scenario's site, and {file} is none; `rfpose view` draws it")
-        _draw(file, picture, force)
+        if found["kind"] not in ("scenario", "recording"):
+            raise InvalidInputError(
+                f"`picture` draws a scenario's site or who recorded when, and {file[0]} is no such file; `rfpose view` "
+                "draws it"
+            )
+        with outputs(picture, inputs=file, force=force):
+            _draw(given, picture, follow_links=follow_links)
     if wants_json():
         emit_json(found if picture is None else {**found, "picture": picture})
         return
-    _print(found, indent=0)
+    _print({key: value for key, value in found.items() if key != "parts"}, indent=0)
+    if "parts" in found:
+        _print_parts(found["parts"])
     if is_site and picture is None:
         from rfpose.pipeline.pictures.site import plan_in_letters
         from rfpose.scenario import load_scenario
 
-        for line in ("", *plan_in_letters(load_scenario(file))):
+        for line in ("", *plan_in_letters(load_scenario(file[0]))):
             say(line)
     if picture is not None:
         say(f"wrote {picture}")
 
 
-def _draw(file: Path, picture: Path, force: bool) -> None:
-    with outputs(picture, inputs=[file], force=force):
-        from rfpose.drawing import save_figure
+def _draw(given: Path | tuple[Path, ...], picture: Path, *, follow_links: bool) -> None:
+    from rfpose.drawing import save_figure
+
+    if isinstance(given, Path) and given.suffix == ".toml" and kind_of(given) != "recording":
         from rfpose.pipeline.pictures.site import site_plan
         from rfpose.scenario import load_scenario
 
-        save_figure(site_plan(load_scenario(file)), picture)
+        save_figure(site_plan(load_scenario(given)), picture)
+        return
+    from rfpose.recording import open_recording
+
+    with open_recording(given, follow_links=follow_links) as recording:
+        save_figure(recording.plot_coverage(), picture)
+
+
+def _print_parts(parts: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print who covers what, one part a line."""
+    rows = [
+        [
+            name,
+            part["format"],
+            _text(part["receivers"] if len(part["receivers"]) < _MANY_RECEIVERS else len(part["receivers"])),
+            _text(part["start_utc"]),
+            _text(part["end_utc"]),
+            f"{part['samples']:,}",
+            str(part["gaps"]),
+        ]
+        for name, part in parts.items()
+    ]
+    table("parts", ["part", "format", "receivers", "from", "until", "samples", "gaps"], rows)
 
 
 def _print(data: Mapping[str, Any], *, indent: int) -> None:

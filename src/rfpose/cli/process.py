@@ -62,9 +62,10 @@ class _Tables:
         "rfpose process measured/drf --scenario site.toml -o result.h5",
         "rfpose process recording.h5 -o result.h5 --reflection estimate",
         "rfpose process recording.h5 -o result.h5 --filter",
+        "rfpose process night/*.h5 cal0/ mirror*.sigmf-meta -o result.h5",
     ),
 )
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Result to write (HDF5).")
 @click.option("--scenario", type=click.Path(path_type=Path), help="Site description; wins over the recording's own.")
 @click.option(
@@ -117,7 +118,7 @@ class _Tables:
 @click.pass_obj
 def command(
     session: CommonOptions,
-    recording: Path,
+    recording: tuple[Path, ...],
     output: Path,
     scenario: Path | None,
     how: _How,
@@ -128,12 +129,14 @@ def command(
 ) -> None:
     """Find receiver positions and mirror normals in a recording.
 
-    RECORDING is an rfpose-iq file, a Digital RF directory or a SigMF file; the last two need --scenario.
+    RECORDING is an rfpose-iq file, a Digital RF directory, SigMF, or another of the known formats; those that hold no
+    scenario need --scenario. Several are one recording: receivers apart, one after the other, formats mixed; so are
+    those in a directory, and those that a manifest names (recording.toml).
 
     Interrupted or killed, the same command goes on where it stopped; the result is the same.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
-    claimed = outputs(output, tables.csv, tables.parquet, inputs=[recording, scenario, how.survey], force=force)
+    claimed = outputs(output, tables.csv, tables.parquet, inputs=[*recording, scenario, how.survey], force=force)
     with claimed, progress("Measuring") as on_progress:
         check_table(tables.parquet, ".parquet")
         result = rfpose.process(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +18,15 @@ from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.journal import Journal
 from rfpose.pipeline.stages import Stopwatch
-from rfpose.recording import Recording, check_against, frame_starts, note_doubts, open_recording
-from rfpose.recording.members import members
+from rfpose.recording import (
+    Recording,
+    RecordingSource,
+    check_against,
+    files_of,
+    frame_starts,
+    note_doubts,
+    open_recording,
+)
 from rfpose.scenario import Scenario, scenario_of
 
 if TYPE_CHECKING:
@@ -31,7 +39,7 @@ _log = logging.getLogger(__name__)
 
 
 def process(
-    recording: Recording | str | Path,
+    recording: Recording | RecordingSource,
     output: str | Path | None = None,
     *,
     scenario: Scenario | str | Path | None = None,
@@ -103,7 +111,7 @@ def process(
     """
     stages = Stopwatch()
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
-    read = recording.files() if isinstance(recording, Recording) else [recording, *members(Path(recording))]
+    read = recording.files() if isinstance(recording, Recording) else files_of(recording)
     scenario_file = None if isinstance(scenario, Scenario) else scenario
     with claim(output, inputs=[*read, scenario_file, survey, kept], force=force) as job:
         with contextlib.ExitStack() as open_files:
@@ -157,7 +165,9 @@ def process(
         return replace(result, profile=stages.summary())
 
 
-def _opened(recording: Recording | str | Path, *, follow_links: bool) -> contextlib.AbstractContextManager[Recording]:
+def _opened(
+    recording: Recording | RecordingSource, *, follow_links: bool
+) -> contextlib.AbstractContextManager[Recording]:
     """Open a recording for the block; one that the caller opened stays open."""
     if isinstance(recording, Recording):
         return contextlib.nullcontext(recording)
@@ -211,7 +221,7 @@ def _settings(
     given: Scenario | str | Path | None,
 ) -> dict[str, str]:
     """Return what the result depends on, without places and times: equal work gives equal bytes."""
-    command = f"rfpose process {recording.path.name} --estimator {estimator} --pose {choice.pose}"
+    command = f"rfpose process {shlex.join(recording.names)} --estimator {estimator} --pose {choice.pose}"
     if isinstance(given, str | Path):
         command += f" --scenario {Path(given).name}"
     if asked["survey"] is not None:

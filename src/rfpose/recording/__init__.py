@@ -1,4 +1,4 @@
-"""IQ on disk: rfpose-iq (HDF5), Digital RF, SigMF.
+"""IQ on disk: rfpose-iq (HDF5), Digital RF, SigMF, WAV, raw samples, and recordings of many such parts.
 
 `open_recording` reads any of them, `RecordingWriter` writes the first, `convert` goes between them.
 """
@@ -6,7 +6,8 @@
 from typing import TYPE_CHECKING, Any
 
 from rfpose.recording.base import GapError, Recording, count_fill, frame_starts, recorded_runs
-from rfpose.recording.opening import open_recording
+from rfpose.recording.declared import Declared
+from rfpose.recording.opening import RecordingSource, files_of, open_recording
 from rfpose.recording.summary import check_against, describe, note_doubts
 from rfpose.recording.writer import RecordingWriter
 
@@ -14,13 +15,16 @@ if TYPE_CHECKING:
     from rfpose.recording.conversion import convert
 
 __all__ = [
+    "Declared",
     "GapError",
     "Recording",
+    "RecordingSource",
     "RecordingWriter",
     "check_against",
     "convert",
     "count_fill",
     "describe",
+    "files_of",
     "frame_starts",
     "note_doubts",
     "open_recording",

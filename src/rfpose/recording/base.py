@@ -33,16 +33,19 @@ __all__ = [
     "Recording",
     "RecordingFormat",
     "SampleFormat",
+    "WrittenFormat",
     "as_stored",
     "count_fill",
     "frame_starts",
+    "merge_rows",
     "own_frames",
     "recorded_runs",
 ]
 
 _log = logging.getLogger(__name__)
 
-RecordingFormat = Literal["rfpose-iq", "digital-rf", "sigmf"]
+WrittenFormat = Literal["rfpose-iq", "digital-rf", "sigmf"]
+RecordingFormat = Literal["rfpose-iq", "digital-rf", "sigmf", "wav", "raw", "gnuradio", "parts"]
 SampleFormat = Literal["int16", "complex64"]
 IqArray = npt.NDArray[Any]
 """(sample, 2) in-phase and quadrature: int16 counts or float32."""
@@ -97,7 +100,8 @@ class Recording(ABC):
     path
         What was opened.
     format
-        ``"rfpose-iq"``, ``"digital-rf"`` or ``"sigmf"``.
+        ``"rfpose-iq"``, ``"digital-rf"``, ``"sigmf"``, ``"wav"``, ``"raw"``, ``"gnuradio"``; or ``"parts"``, see
+        `open_recording`.
     receiver_ids
         Receivers in file order.
     sample_rate
@@ -117,6 +121,10 @@ class Recording(ABC):
     doubts
         What the file says that cannot be right, or does not say and should, by receiver; one line each. `describe`
         calls these problems.
+    notes
+        What is wrong with the recording as a whole, such as parts that could not be read; one line each.
+    names
+        What was given to open it: more than one name where it is made of parts.
     time_known
         Whether indices count from the Unix epoch; else the file has no time, and they count from its start.
     """
@@ -146,6 +154,8 @@ class Recording(ABC):
         self.truth = truth
         self.provenance: dict[str, str] = dict(provenance or {})
         self.doubts: dict[str, list[str]] = {}
+        self.notes: list[str] = []
+        self.names: tuple[str, ...] = (path.name,)
         self.time_known = True
         self._segments: dict[str, IndexArray] = {}
         self._blocks: dict[str, IndexArray] = {}
@@ -237,6 +247,18 @@ class Recording(ABC):
 
         return draw_spectrum(self, receiver_id=receiver_id)
 
+    def plot_coverage(self) -> Figure:
+        """Draw who recorded when: a line a receiver, each part of the recording in its colour.
+
+        Raises
+        ------
+        RecordingError
+            The recording is damaged, or holds no samples.
+        """
+        from rfpose.recording.picture import draw_coverage
+
+        return draw_coverage(self)
+
     @property
     def fill_value(self) -> float:
         """What I and Q both hold where the file has room for a sample that was never written; see `count_fill`."""
@@ -263,7 +285,7 @@ class Recording(ABC):
             The file is damaged.
         """
         if receiver_id not in self._blocks:
-            self._blocks[receiver_id] = read_only(_merge(self._segments_of(receiver_id)))
+            self._blocks[receiver_id] = read_only(merge_rows(self._segments_of(receiver_id)))
         return self._blocks[receiver_id]
 
     def covers(self, receiver_id: str, start_index: int, count: int) -> bool:
@@ -378,7 +400,7 @@ def recorded_runs(recording: Recording, receiver_ids: Sequence[str] | None = Non
     """Return the stretches in which at least one receiver (of those named) recorded: (run, 2) [start index, count]."""
     names = recording.receiver_ids if receiver_ids is None else receiver_ids
     rows = np.concatenate([np.empty((0, 2), np.int64), *(recording.blocks(name) for name in names)])
-    return _merge(rows[np.argsort(rows[:, 0], kind="stable")])
+    return merge_rows(rows[np.argsort(rows[:, 0], kind="stable")])
 
 
 def frame_starts(recording: Recording, frame_samples: int) -> IndexArray:
@@ -475,7 +497,7 @@ def _best_offsets(recording: Recording, runs: IndexArray, frame_samples: int) ->
     return offset
 
 
-def _merge(rows: IndexArray) -> IndexArray:
+def merge_rows(rows: IndexArray) -> IndexArray:
     """Join rows [start, count], sorted by start, that touch or overlap."""
     if len(rows) == 0:
         return np.empty((0, 2), np.int64)

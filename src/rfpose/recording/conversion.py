@@ -17,7 +17,7 @@ import numpy as np
 from rfpose import __version__
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
-from rfpose.recording.base import IqArray, Recording, RecordingFormat
+from rfpose.recording.base import IqArray, Recording, WrittenFormat
 from rfpose.recording.drf import CENTRE_FREQUENCIES, import_digital_rf
 from rfpose.recording.members import members
 from rfpose.recording.sidecar import SCENARIO_FILE
@@ -69,8 +69,8 @@ def convert(
         The target exists, is or holds what is read, or cannot be written; the format's library is missing; the source
         is damaged.
     """
-    if format not in get_args(RecordingFormat):
-        raise InvalidInputError(f"`format` must be one of {', '.join(get_args(RecordingFormat))}, got {format!r}")
+    if format not in get_args(WrittenFormat):
+        raise InvalidInputError(f"`format` must be one of {', '.join(get_args(WrittenFormat))}, got {format!r}")
     target = Path(target_path)
     inputs = source.files()
     if format == "rfpose-iq":

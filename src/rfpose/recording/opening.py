@@ -1,40 +1,65 @@
-"""Find out what a path holds and open it."""
+"""Find out what a path, or several, hold and open it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
 from pathlib import Path
+from typing import TypeAlias
 
-from rfpose.errors import RecordingError
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.kinds import kind_of
 from rfpose.recording.base import Recording
+from rfpose.recording.declared import Declared
+from rfpose.recording.manifest import MANIFEST_FILE, is_manifest, read_manifest
+from rfpose.recording.members import members
 from rfpose.recording.native import NativeRecording
-from rfpose.scenario import Scenario
+from rfpose.recording.parts import Part, PartsRecording
+from rfpose.scenario import Scenario, load_scenario
 
-__all__ = ["open_recording"]
+__all__ = ["RecordingSource", "files_of", "open_recording"]
 
-_SIGMF_SUFFIXES = (".sigmf-meta", ".sigmf-data")
+RecordingSource: TypeAlias = str | Path | Sequence[str | Path]
+"""What `open_recording` opens: one path, or several that make one recording."""
+
+_SIGMF_SUFFIXES = (".sigmf-meta", ".sigmf-data", ".sigmf", ".sigmf-collection")
+_COMPRESSED_SIGMF = (".sigmf.gz", ".sigmf.xz", ".sigmf.zip", ".sigmf.bz2")
+_IN_A_SET = ("*.h5", "*.hdf5", "*.wav", "*.WAV", "*.sigmf", "*.hdr")
+"""Files in a directory that may be parts of a recording."""
 
 
-def open_recording(path: str | Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> Recording:
-    """Open a recording, whichever of the known formats it has.
+def open_recording(
+    path: RecordingSource,
+    *,
+    scenario: Scenario | None = None,
+    declared: Declared | None = None,
+    follow_links: bool = False,
+) -> Recording:
+    """Open a recording, whichever of the known formats it has, in one file or in many.
 
     Parameters
     ----------
     path
-        An rfpose-iq file; a Digital RF directory, whose channels are the receivers; a directory of SigMF
-        recordings, one a receiver, or one ``.sigmf-meta`` file.
+        An rfpose-iq file; a Digital RF directory, whose channels are the receivers; SigMF: a ``.sigmf-meta`` file, a
+        directory of them, an archive or a collection; a WAV file of IQ; a file of GNU Radio with its detached header
+        (``.hdr``); a manifest (``recording.toml``) or the directory of one; a directory of several of these; or
+        a list of all these. Several are one recording: receivers apart, one after the other in time, or both.
     scenario
         The site, in place of the one found in the recording. It is not compared with the recording here; see
         `check_against`.
+    declared
+        What a file of raw samples or a WAV file does not say of itself; for every file that is given.
     follow_links
         Read what the recording names outside its own folder, too: links in the file system, SigMF's ``core:dataset``,
-        HDF5's external links, external storage and virtual datasets. A recording from elsewhere could so make any
-        file be read.
+        HDF5's external links, external storage and virtual datasets, files of a manifest. A recording from elsewhere
+        could so make any file be read.
 
     Raises
     ------
     RecordingError
         Nothing there, another format, damaged, or a library for the format is not installed. The message
-        names the file, the place inside it and the remedy.
+        names the file, the place inside it and the remedy. Of several parts those that cannot be read are left out and
+        told in `Recording.notes`; parts that contradict each other are refused.
     ScenarioError
         The embedded scenario is malformed.
 
@@ -44,23 +69,66 @@ def open_recording(path: str | Path, *, scenario: Scenario | None = None, follow
     >>> with rf.open_recording("night.h5") as recording:  # doctest: +SKIP
     ...     recording.plot()
     """
+    if not isinstance(path, str | Path):
+        given = [Path(each) for each in path]
+        if not given:
+            raise InvalidInputError("`path` must name at least one recording")
+        if len(given) > 1:
+            return _open_set(given, scenario=scenario, declared=declared, follow_links=follow_links)
+        path = given[0]
     path = Path(path)
+    _refuse_missing(path)
+    if declared is None:
+        if path.is_dir() and (path / MANIFEST_FILE).is_file():
+            path = path / MANIFEST_FILE
+        if is_manifest(path):
+            return _open_manifest(path, scenario=scenario, follow_links=follow_links)
+        if path.is_dir():
+            found = _found_in(path)
+            if found and found != [path]:
+                return _open_set(found, scenario=scenario, declared=None, follow_links=follow_links, whole=path)
+    return _open_one(path, scenario, declared=declared, follow_links=follow_links)
+
+
+def files_of(path: RecordingSource) -> list[Path]:
+    """Return what would be read as a recording, before it is opened: nothing else may be written there."""
+    found: list[Path] = []
+    for one in [path] if isinstance(path, str | Path) else path:
+        one = Path(one)
+        found += [one, *members(one)]
+        manifest = one / MANIFEST_FILE if one.is_dir() else one
+        if is_manifest(manifest):
+            try:
+                read = read_manifest(manifest, follow_links=True)
+            except RecordingError:  # said when it is opened
+                continue
+            named = [entry.path for entry in read.entries] + ([] if read.scenario is None else [read.scenario])
+            found += [file for entry in named for file in (entry, *members(entry))]
+        elif one.is_dir():
+            found += [file for part in _found_in(one) if part != one for file in (part, *members(part))]
+    return found
+
+
+def _refuse_missing(path: Path) -> None:
     try:
         exists = path.exists()
     except (OSError, ValueError) as error:  # too long, or with a zero byte
         raise RecordingError(f"{str(path)!r:.200}: no path of a file ({error!s:.60}); check the path") from error
     if not exists:
         raise RecordingError(f"{path}: no such file or directory; check the path")
+
+
+def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | None, follow_links: bool) -> Recording:
+    """Open what is one recording in one format."""
+    _refuse_missing(path)
     if path.is_dir():
         return _open_directory(path, scenario, follow_links=follow_links)
     if path.suffix in _SIGMF_SUFFIXES:
         from rfpose.recording.sigmf_files import SigmfRecording
 
         return SigmfRecording(path, scenario=scenario, follow_links=follow_links)
-    if path.suffix in (".sigmf", ".sigmf-collection"):
-        raise RecordingError(
-            f"{path}: a SigMF archive or collection; unpack it (`tar xf`) and give the directory of .sigmf-meta files"
-        )
+    if path.name.lower().endswith(_COMPRESSED_SIGMF):
+        raise RecordingError(f"{path}: a compressed SigMF archive; unpack it (`tar xf`) and give the directory")
     return NativeRecording(path, scenario=scenario, follow_links=follow_links)
 
 
@@ -77,5 +145,110 @@ def _open_directory(path: Path, scenario: Scenario | None, *, follow_links: bool
         raise RecordingError(f"{path}: this is one channel of a Digital RF recording; give `{path.parent}` instead")
     raise RecordingError(
         f"{path}: a directory with neither Digital RF channels (*/drf_properties.h5) nor SigMF recordings "
-        "(*.sigmf-meta); check the path"
+        "(*.sigmf-meta) nor other recordings; check the path"
     )
+
+
+# -- sets ----------------------------------------------------------------------------------------------------
+
+
+def _found_in(path: Path) -> list[Path]:
+    """Return the recordings in a directory: itself where it is one, files in it, directories in it that are one."""
+    if (path / "drf_properties.h5").exists():
+        return []
+    found = [path] if any(path.glob("*/drf_properties.h5")) or any(path.glob("*.sigmf-meta")) else []
+    found += sorted(file for pattern in _IN_A_SET for file in path.glob(pattern) if _is_part(file))
+    for folder in sorted(path.iterdir()):
+        is_channel = (folder / "drf_properties.h5").exists()
+        if folder.is_dir() and not folder.is_symlink() and not is_channel and not folder.name.startswith("."):
+            found += [folder] if any(folder.glob("*/drf_properties.h5")) or any(folder.glob("*.sigmf-meta")) else []
+    return list(dict.fromkeys(found))
+
+
+def _is_part(file: Path) -> bool:
+    """Whether a file in a directory is a recording, and not a result or something else of the same ending."""
+    return file.is_file() and (file.suffix not in (".h5", ".hdf5") or kind_of(file) == "recording")
+
+
+def _open_set(
+    given: Sequence[Path],
+    *,
+    scenario: Scenario | None,
+    declared: Declared | None,
+    follow_links: bool,
+    whole: Path | None = None,
+) -> Recording:
+    """Open several paths as one recording; ``whole`` is the directory that was given for them."""
+    paths: list[Path] = []
+    for path in given:
+        if is_manifest(path):
+            raise RecordingError(
+                f"{path}: a manifest stands for a whole recording; give it alone, or write all into it"
+            )
+        inner = _found_in(path) if path.is_dir() and declared is None and path != whole else [path]
+        paths += inner or [path]
+    paths = list(dict.fromkeys(paths))
+    names = _short_names(paths, within=whole)
+    parts = [Part(name=names[path], open=_opener(path, declared=declared, follow_links=follow_links)) for path in paths]
+    more = f" and {len(given) - 1} more"
+    return PartsRecording(
+        whole if whole is not None else given[0].with_name(given[0].name + more),
+        parts,
+        names=(whole.name,) if whole is not None else tuple(path.name for path in given),
+        scenario=scenario,
+    )
+
+
+def _open_manifest(path: Path, *, scenario: Scenario | None, follow_links: bool) -> Recording:
+    manifest = read_manifest(path, follow_links=follow_links)
+    if scenario is None and manifest.scenario is not None:
+        scenario = load_scenario(manifest.scenario)
+    notes = list(manifest.notes)
+    names = _short_names([entry.path for entry in manifest.entries], within=path.parent)
+    parts = []
+    for entry in manifest.entries:
+        receivers = entry.receivers
+        opener = _opener(entry.path, declared=entry.declared, follow_links=follow_links)
+        if isinstance(receivers, tuple):
+            receivers = _in_order(opener, receivers, names[entry.path], notes)
+        parts.append(
+            Part(
+                name=names[entry.path],
+                open=opener,
+                receivers=receivers,
+                offset_s=entry.offset_s if entry.offset_s is not None else Fraction(0),
+                find_offset=entry.offset_s is None,
+                start_s=entry.start_s,
+            )
+        )
+    return PartsRecording(path, parts, names=(path.name,), scenario=scenario, notes=notes)
+
+
+def _in_order(
+    opener: Callable[[Scenario | None], Recording], receivers: Sequence[str], name: str, notes: list[str]
+) -> dict[str, str] | None:
+    """Return names by the part's own, in its order."""
+    try:
+        with opener(None) as recording:
+            own = recording.receiver_ids
+    except RecordingError:  # told when the whole is opened
+        return None
+    if len(own) != len(receivers):
+        notes.append(f"{name} has {len(own)} receivers ({', '.join(own[:4])}), the manifest names {len(receivers)}")
+    return dict(zip(own, receivers, strict=False))
+
+
+def _opener(path: Path, *, declared: Declared | None, follow_links: bool) -> Callable[[Scenario | None], Recording]:
+    def opened(scenario: Scenario | None) -> Recording:
+        return _open_one(path, scenario, declared=declared, follow_links=follow_links)
+
+    return opened
+
+
+def _short_names(paths: Iterable[Path], *, within: Path | None) -> dict[Path, str]:
+    """Return what to call parts: short, and each its own."""
+    paths = list(paths)
+    if within is not None:
+        return {path: str(path.relative_to(within)) if path.is_relative_to(within) else str(path) for path in paths}
+    short = [path.name for path in paths]
+    return {path: path.name if short.count(path.name) == 1 else str(path) for path in paths}

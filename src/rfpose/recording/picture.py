@@ -7,16 +7,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.drawing import new_figure
-from rfpose.errors import InvalidInputError
+from rfpose.drawing import SERIES, WIDTH_INCH, new_figure
+from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.recording.base import Recording, frame_starts
+from rfpose.recording.parts import blocks_by_part
+from rfpose.recording.stamps import stamp_text
 from rfpose.scenario import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_spectrum"]
+__all__ = ["draw_coverage", "draw_spectrum"]
 
+_MOST_NAMES = 60
+"""Receivers beyond that are drawn without their names."""
+_LEGEND = 12
+"""Parts beyond that are not named."""
 _LINES_PER_TONE = 16
 _FLOOR = 1e-20
 
@@ -55,6 +61,48 @@ def draw_spectrum(recording: Recording, *, scenario: Scenario | None = None, rec
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     bin_khz = 1e-3 * (frequency_hz[1] - frequency_hz[0])
     axes.set_title(f"Receiver {receiver_id}: {len(line_mhz)} transmitters (bins of {bin_khz:.3g} kHz)")
+    return figure
+
+
+def draw_coverage(recording: Recording) -> Figure:
+    """Draw who recorded when: a line a receiver, each part of the recording in its colour.
+
+    Raises
+    ------
+    RecordingError
+        The recording is damaged, or holds no samples.
+    """
+    row = {name: i for i, name in enumerate(recording.receiver_ids)}
+    parts = blocks_by_part(recording)
+    starts = [int(rows[0, 0]) for _, blocks in parts for rows in blocks.values() if len(rows)]
+    if not starts:
+        raise RecordingError(f"{recording.path}: no samples were recorded; check it with `rfpose info`")
+    first, rate = min(starts), float(recording.sample_rate)
+    figure, axes = new_figure(WIDTH_INCH, 1.4 + 0.22 * min(len(row), _MOST_NAMES))
+    for k, (name, blocks) in enumerate(parts):
+        label: str | None = name if k < _LEGEND else None
+        for receiver_id, rows in blocks.items():
+            spans = np.stack([rows[:, 0] - first, rows[:, 1]], axis=1) / rate
+            axes.broken_barh(
+                [(float(begin), float(lasts)) for begin, lasts in spans],
+                (row[receiver_id] - 0.35, 0.7),
+                facecolors=SERIES[k % len(SERIES)],
+                label=label,
+            )
+            label = None
+    axes.set_ylim(len(row) - 0.5, -0.5)
+    if len(row) <= _MOST_NAMES:
+        axes.set_yticks(range(len(row)), list(row))
+    else:
+        axes.set_ylabel("receiver")
+    since = f" since {stamp_text(first, recording.sample_rate)[:-10]}Z" if recording.time_known else ""
+    axes.set_xlabel(f"time{since} [s]")
+    axes.grid(alpha=0.3, axis="x")
+    handles, labels = axes.get_legend_handles_labels()
+    if len(parts) > 1:
+        more = f"and {len(parts) - _LEGEND} more" if len(parts) > _LEGEND else None
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, title=more)
+    axes.set_title(f"{recording.path.name}: who recorded when")
     return figure
 
 

@@ -1,32 +1,39 @@
-"""SigMF recordings, one a receiver; the sigmf library reads the metadata, the samples are read in place."""
+"""SigMF recordings, one a receiver; the sigmf library checks the metadata, the samples are read in place."""
 
 from __future__ import annotations
 
-import math
+import tarfile
 import warnings
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, install_remedy
-from rfpose.foreign import exact_number, exact_rate, load_json
-from rfpose.recording.base import COMPONENT_DTYPE, IndexArray, IqArray, Recording, SampleFormat
+from rfpose.foreign import TEXT_BYTES, exact_number, exact_rate, load_json, parse_json
+from rfpose.recording.base import IndexArray, SampleFormat
+from rfpose.recording.flat import FlatRecording, FlatStream, SampleType, sample_type
+from rfpose.recording.hdf5 import printable
 from rfpose.recording.links import FOLLOW, refuse_outside
 from rfpose.recording.sidecar import load_sidecar_scenario
 from rfpose.recording.stamps import LARGEST_INDEX, Capture, parse_stamp, place_captures
 from rfpose.scenario import Scenario
 
-__all__ = ["DATATYPES", "META_SUFFIX", "SigmfRecording", "import_sigmf"]
+__all__ = ["ARCHIVE_SUFFIX", "COLLECTION_SUFFIX", "DATATYPES", "META_SUFFIX", "SigmfRecording", "import_sigmf"]
 
 META_SUFFIX: Final = ".sigmf-meta"
+ARCHIVE_SUFFIX: Final = ".sigmf"
+COLLECTION_SUFFIX: Final = ".sigmf-collection"
 DATATYPES: Final[dict[SampleFormat, str]] = {"int16": "ci16_le", "complex64": "cf32_le"}
-"""What is written; big-endian twins are read as well."""
+"""What is written; `rfpose.recording.flat.SAMPLE_TYPES` are read."""
 
 _CAPTURES_VALIDATED: Final = 100
 _SINCE_S: Final = 10**8
 """An index without a time stamp that would lie before 1973 counts from something else than the epoch."""
+_MOST_CHANNELS: Final = 1024
+_MOST_MEMBERS: Final = 10_000
 
 
 def import_sigmf() -> Any:
@@ -40,105 +47,202 @@ def import_sigmf() -> Any:
     return sigmf
 
 
-class _Stream(NamedTuple):
-    """One receiver's pair of files."""
+class _Place(NamedTuple):
+    """Where samples lie: a file, or a stretch of bytes in an archive."""
 
-    data: Path
+    file: Path
+    first: int
+    n_byte: int
+
+
+class _Described(NamedTuple):
+    """Metadata that was found, and how to find the samples that it describes."""
+
+    name: str
+    where: str
+    content: Any
+    samples: Callable[[Any], _Place]
+    """Takes what ``core:dataset`` says."""
+
+
+class _Signal(NamedTuple):
+    """What one recording's metadata says: the streams of its channels, in their order."""
+
+    streams: list[FlatStream]
     rate: Fraction
-    sample_format: SampleFormat
-    big_endian: bool
+    type: SampleType
     centre_frequency_hz: float | None
-    segments: IndexArray
-    """(segment, 3) rows [start index, count, offset in the data file]."""
     about: dict[str, str]
-    doubts: list[str]
-    time_known: bool
 
 
-class SigmfRecording(Recording):
-    """A directory of SigMF recordings, or a single one. Open it through `open_recording`.
+class SigmfRecording(FlatRecording):
+    """A directory of SigMF recordings, a single one, an archive or a collection. Open it through `open_recording`.
 
-    The receiver is named as the file is. On how time is found see `place_captures`.
+    The receiver is named as the file is, channels of one file ``NAME_r0``, ``NAME_r1`` and so on. On how time is found
+    see `place_captures`.
     """
 
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         library = import_sigmf()
-        if path.is_dir():
-            metas = sorted(path.glob(f"*{META_SUFFIX}"))
-        else:
-            metas = [path.with_suffix(META_SUFFIX)]
-        self._streams = {
-            meta.name.removesuffix(META_SUFFIX): _load(library, meta, follow_links=follow_links) for meta in metas
-        }
-        first = next(iter(self._streams.values()))
-        for receiver_id, stream in self._streams.items():
-            for what in ("rate", "sample_format", "centre_frequency_hz"):
-                if getattr(stream, what) != getattr(first, what):
+        notes: list[str] = []
+        signals = {found.name: _signal(library, found) for found in _described(path, notes, follow_links=follow_links)}
+        if not signals:
+            raise RecordingError(f"{path}: holds no metadata of SigMF; check that it is the right file")
+        first_name, first = next(iter(signals.items()))
+        for name, signal in signals.items():
+            for what, mine, theirs in (
+                ("rate", signal.rate, first.rate),
+                ("sample type", signal.type.name, first.type.name),
+                ("centre frequency", signal.centre_frequency_hz, first.centre_frequency_hz),
+            ):
+                alike = what == "sample type" and _alike(signal.type, first.type)
+                if mine != theirs and not alike:
                     raise RecordingError(
-                        f"{path}: `{receiver_id}` and `{metas[0].name.removesuffix(META_SUFFIX)}` differ in {what}: "
-                        f"{getattr(stream, what)} and {getattr(first, what)}; put them into separate directories"
+                        f"{path}: `{name}` and `{first_name}` differ in {what}: {mine} and {theirs}; put them into "
+                        "separate directories"
                     )
-        self._files: dict[str, BinaryIO] = {}
+        folder = path if path.is_dir() else path.parent
         super().__init__(
             path,
+            _receivers(path, signals),
             format="sigmf",
-            receiver_ids=tuple(self._streams),
             sample_rate=first.rate,
             centre_frequency_hz=first.centre_frequency_hz,
-            sample_format=first.sample_format,
-            full_scale=32767.0 if first.sample_format == "int16" else math.inf,
-            scenario=scenario
-            if scenario is not None
-            else load_sidecar_scenario(metas[0].parent, follow_links=follow_links),
+            scenario=scenario if scenario is not None else load_sidecar_scenario(folder, follow_links=follow_links),
             provenance=first.about,
         )
-        self.doubts = {name: stream.doubts for name, stream in self._streams.items() if stream.doubts}
-        self.time_known = all(stream.time_known for stream in self._streams.values())
-
-    def close(self) -> None:
-        """Close the data files."""
-        for file in self._files.values():
-            file.close()
-        self._files.clear()
-
-    def _load_segments(self, receiver_id: str) -> IndexArray:
-        return self._streams[receiver_id].segments[:, :2]
-
-    def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
-        stream = self._streams[receiver_id]
-        try:
-            if receiver_id not in self._files:
-                self._files[receiver_id] = stream.data.open("rb", buffering=0)
-            file = self._files[receiver_id]
-            file.seek((int(stream.segments[i_segment, 2]) + skip) * out.itemsize * 2)
-            rest = out.data.cast("B")
-            while rest:  # one call reads 2 GiB at most
-                n_read = file.readinto(rest)  # type: ignore[attr-defined]
-                if not n_read:
-                    raise RecordingError(f"{stream.data}: the file became shorter since it was opened; open it again")
-                rest = rest[n_read:]
-        except RecordingError:
-            raise
-        except OSError as error:
-            raise RecordingError(f"{stream.data}: cannot read: {error.strerror or error}; check the file") from error
-        if stream.big_endian:
-            out.byteswap(inplace=True)
+        self.notes = notes
 
 
-def _load(library: Any, meta: Path, *, follow_links: bool) -> _Stream:
-    if not follow_links:
-        refuse_outside(meta.parent, meta, named_by=meta)
-    content = load_json(meta)
+def _alike(one: SampleType, other: SampleType) -> bool:
+    """Whether two types are read as the same numbers."""
+    return (one.sample_format, one.full_scale) == (other.sample_format, other.full_scale)
+
+
+def _receivers(path: Path, signals: Mapping[str, _Signal]) -> dict[str, FlatStream]:
+    """Return the receivers of all channels."""
+    found: dict[str, FlatStream] = {}
+    for name, signal in signals.items():
+        for k, stream in enumerate(signal.streams):
+            receiver_id = name if len(signal.streams) == 1 else f"{name}_r{k}"
+            if receiver_id in found or (receiver_id != name and receiver_id in signals):
+                raise RecordingError(
+                    f"{path}: `{receiver_id}` stands beside channel {k} of `{name}`, which is read under the same "
+                    "name; rename one of the two"
+                )
+            found[receiver_id] = stream
+    return found
+
+
+def _described(path: Path, notes: list[str], *, follow_links: bool) -> Iterator[_Described]:
+    """Yield the metadata that a path stands for; what a collection lacks is added to ``notes``."""
+    if path.is_dir():
+        metas = sorted(path.glob(f"*{META_SUFFIX}"))
+    elif path.suffix == ARCHIVE_SUFFIX:
+        yield from _in_archive(path)
+        return
+    elif path.suffix == COLLECTION_SUFFIX:
+        metas = _of_collection(path, notes)
+    else:
+        metas = [path.with_suffix(META_SUFFIX)]
+    for meta in metas:
+        if not follow_links:
+            refuse_outside(meta.parent, meta, named_by=meta)
+
+        def samples(named: Any, meta: Path = meta) -> _Place:
+            data = _data_file(meta, named, follow_links=follow_links)
+            return _Place(data, 0, data.stat().st_size)
+
+        yield _Described(meta.name.removesuffix(META_SUFFIX), str(meta), load_json(meta), samples)
+
+
+def _of_collection(path: Path, notes: list[str]) -> list[Path]:
+    """Return the metadata files that a collection names beside it."""
+    content = load_json(path)
+    body = content.get("collection") if isinstance(content, dict) else None
+    streams = body.get("core:streams", []) if isinstance(body, dict) else None
+    if not isinstance(streams, list):
+        raise RecordingError(f"{path}: must hold a `collection` with `core:streams`; correct it")
+    found = []
+    for i, stream in enumerate(streams):
+        name = stream.get("name") if isinstance(stream, dict) else stream  # as a plain name before version 1.0
+        if not isinstance(name, str) or not name or Path(name).name != name or "\0" in name or len(name) > 255:
+            raise RecordingError(f"{path}: `core:streams` {i} must name a recording beside it, got {name!r:.60}")
+        meta = path.with_name(name.removesuffix(META_SUFFIX) + META_SUFFIX)
+        if not meta.is_file():
+            notes.append(f"`{path.name}` names `{printable(meta.name):.80}`, which is missing")
+            continue
+        digest = stream.get("hash") if isinstance(stream, dict) else None
+        if isinstance(digest, str) and digest.lower() != _sha512(meta):
+            notes.append(f"`{meta.name}` was changed since `{path.name}` was written: its checksum differs")
+        found.append(meta)
+    if not found:
+        raise RecordingError(f"{path}: none of the recordings that it names is beside it; copy them there")
+    return found
+
+
+def _sha512(path: Path) -> str:
+    import hashlib
+
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha512").hexdigest()
+
+
+def _in_archive(path: Path) -> Iterator[_Described]:
+    """Yield what an uncompressed archive holds; samples are read where they lie in it."""
+    metas: dict[str, str] = {}
+    data: dict[str, _Place] = {}
     try:
-        _check_schema(library, content)
-        return _stream(meta, content, follow_links=follow_links)
+        with tarfile.open(path, "r:") as archive:
+            for i, member in enumerate(archive):
+                if i >= _MOST_MEMBERS:
+                    raise RecordingError(f"{path}: more than {_MOST_MEMBERS} members; unpack it (`tar xf`)")
+                name = printable(Path(member.name).name)
+                if not member.isreg() or member.issparse():
+                    continue
+                if not name.endswith(META_SUFFIX):
+                    data[name] = _Place(path, member.offset_data, member.size)
+                    continue
+                file = archive.extractfile(member)
+                stored = b"" if file is None else file.read(TEXT_BYTES + 1)
+                if len(stored) > TEXT_BYTES:
+                    raise RecordingError(f"{path}: `{name}` is longer than {TEXT_BYTES:_} bytes; check the archive")
+                metas[name] = stored.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: its metadata is not UTF-8; make the archive again") from error
+    except (tarfile.TarError, ValueError, EOFError, OverflowError) as error:
+        raise RecordingError(
+            f"{path}: no sound uncompressed archive ({error!s:.100}); unpack it (`tar xf`) and give the directory"
+        ) from error
+    size = path.stat().st_size
+    for name, text in sorted(metas.items()):
+        where = f"{path}: {name}"
+
+        def samples(named: Any, name: str = name, where: str = where) -> _Place:
+            wanted = named if named is not None else name.removesuffix(META_SUFFIX) + ".sigmf-data"
+            found = data.get(wanted) if isinstance(wanted, str) else None
+            if found is None:
+                raise RecordingError(f"{where}: its samples, `{wanted!r:.80}`, are not in the archive; make it again")
+            if found.first + found.n_byte > size:
+                raise RecordingError(f"{where}: the archive is truncated; copy it again")
+            return found
+
+        yield _Described(name.removesuffix(META_SUFFIX), where, parse_json(text, source=where), samples)
+
+
+def _signal(library: Any, found: _Described) -> _Signal:
+    try:
+        _check_schema(library, found.content)
+        return _read(found)
     except InvalidInputError as error:
-        raise RecordingError(f"{meta}: {error}; correct the file") from error
+        raise RecordingError(f"{found.where}: {error}; correct the file") from error
     except RecordingError:
         raise
     except OSError as error:  # a name that is too long, a folder that may not be looked into
         what = error.strerror or error
-        raise RecordingError(f"{meta}: cannot read the file of samples: {what}; check its name and rights") from error
+        raise RecordingError(
+            f"{found.where}: cannot read the file of samples: {what}; check its name and rights"
+        ) from error
 
 
 def _check_schema(library: Any, content: Any) -> None:
@@ -166,44 +270,66 @@ def _check_schema(library: Any, content: Any) -> None:
         raise InvalidInputError(f"cannot read: no SigMF metadata ({type(error).__name__}: {error})"[:200]) from error
 
 
-def _stream(meta: Path, content: dict[str, Any], *, follow_links: bool) -> _Stream:
-    found = content["global"]
-    datatype = str(found["core:datatype"])
-    sample_format = next((name for name, known in DATATYPES.items() if datatype[:4] == known[:4]), None)
-    if sample_format is None:
-        raise InvalidInputError(
-            f"`core:datatype` is {datatype:.20}; rfpose reads ci16 and cf32: convert the recording to one of them"
-        )
-    for name in ("core:offset", "core:trailing_bytes"):
-        if found.get(name, 0):
-            raise InvalidInputError(f"`{name}` is not supported; write the recording as one conforming dataset")
-    captures = content.get("captures") or [{"core:sample_start": 0}]
-    if found.get("core:num_channels", 1) != 1 or any(capture.get("core:header_bytes", 0) for capture in captures):
-        raise InvalidInputError(
-            "interleaved channels and headers within the samples are not supported; write one conforming dataset a "
-            "receiver"
-        )
-    if "core:sample_rate" not in found:
+def _read(found: _Described) -> _Signal:
+    general = found.content["global"]
+    datatype = str(general["core:datatype"])
+    try:
+        kind = sample_type(datatype)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"`core:datatype` is {datatype:.20}; {error}") from error
+    if "core:sample_rate" not in general:
         raise InvalidInputError("`core:sample_rate` is missing; add it")
-    rate = exact_rate("core:sample_rate", found["core:sample_rate"])
-    data = _data_file(meta, found.get("core:dataset"), follow_links=follow_links)
-    n_sample, rest = divmod(data.stat().st_size, 2 * COMPONENT_DTYPE[sample_format].itemsize)
-    if rest:
+    rate = exact_rate("core:sample_rate", general["core:sample_rate"])
+    n_channel = _count(general, "core:num_channels", 1)
+    if not 1 <= n_channel <= _MOST_CHANNELS:
+        raise InvalidInputError(f"`core:num_channels` must be 1 to {_MOST_CHANNELS}, is {n_channel}")
+    offset = _count(general, "core:offset")
+    captures = found.content.get("captures") or [{"core:sample_start": offset}]
+    for i, capture in enumerate(captures):
+        if not isinstance(capture, dict):
+            raise InvalidInputError(f"capture {i} must be a JSON object, got {capture!r:.60}")
+    headers = [_count(capture, "core:header_bytes") for capture in captures]
+    place = found.samples(general.get("core:dataset"))
+    width = kind.sample_bytes * n_channel
+    n_byte = place.n_byte - sum(headers) - _count(general, "core:trailing_bytes")
+    n_sample, rest = divmod(n_byte, width)
+    if rest or n_sample < 0:
+        channels = "" if n_channel == 1 else f" in {n_channel} channels"
         raise RecordingError(
-            f"{data}: does not hold an integer number of samples of {datatype}: {rest} bytes are left; copy it again"
+            f"{place.file}: does not hold an integer number of samples of {datatype}{channels}: "
+            f"{rest if n_sample >= 0 else n_byte} bytes are left; copy it again"
         )
-    segments, doubts, time_known = _segments(captures, n_sample, rate)
-    return _Stream(
-        data=data,
-        rate=rate,
-        sample_format=sample_format,
-        big_endian=datatype.endswith("_be"),
-        centre_frequency_hz=_tuning(captures),
-        segments=segments,
-        about={name: str(found[name]) for name in ("core:recorder", "core:hw", "core:description") if name in found},
-        doubts=doubts,
-        time_known=time_known,
-    )
+    rows, doubts, time_known = _segments(captures, n_sample, rate, offset=offset)
+    # a segment's samples follow those before it and all headers up to its own
+    before = np.cumsum(np.array(headers, np.int64))[rows[:, 3]]
+    segments = np.stack([rows[:, 0], rows[:, 1], place.first + before + rows[:, 2] * width], axis=1)
+    streams = [
+        FlatStream(
+            file=place.file,
+            type=kind,
+            segments=segments,
+            channels=n_channel,
+            channel=k,
+            doubts=doubts,
+            time_known=time_known,
+        )
+        for k in range(n_channel)
+    ]
+    about = {
+        name: printable(str(general[name]))
+        for name in ("core:recorder", "core:hw", "core:description")
+        if name in general
+    }
+    return _Signal(streams, rate, kind, _tuning(captures), about)
+
+
+def _count(data: Mapping[str, Any], name: str, default: int = 0) -> int:
+    """Return a number of something that can be counted."""
+    value = data.get(name, default)
+    exact = exact_number(name, value)
+    if exact.denominator != 1 or not 0 <= exact < LARGEST_INDEX:
+        raise InvalidInputError(f"`{name}` must be a whole number below {LARGEST_INDEX}, got {value!r:.40}")
+    return int(exact)
 
 
 def _data_file(meta: Path, named: Any, *, follow_links: bool) -> Path:
@@ -233,9 +359,11 @@ def _tuning(captures: list[dict[str, Any]]) -> float | None:
     return None if tuning is None else float(exact_number("core:frequency", tuning))
 
 
-def _segments(captures: list[dict[str, Any]], n_sample: int, rate: Fraction) -> tuple[IndexArray, list[str], bool]:
-    """Return (segment, 3) rows [start index, count, offset], what is doubtful, and whether the time is known."""
-    found = [_capture(i, capture, rate) for i, capture in enumerate(captures)]
+def _segments(
+    captures: list[dict[str, Any]], n_sample: int, rate: Fraction, *, offset: int
+) -> tuple[IndexArray, list[str], bool]:
+    """Return (segment, 4) rows [start index, count, sample, capture], doubts, and whether the time is known."""
+    found = [_capture(i, capture, rate, offset=offset) for i, capture in enumerate(captures)]
     ends = [c.first_sample for c in found[1:]] + [n_sample]
     for i, (capture, end) in enumerate(zip(found, ends, strict=True)):
         if capture.first_sample > n_sample:
@@ -250,8 +378,8 @@ def _segments(captures: list[dict[str, Any]], n_sample: int, rate: Fraction) -> 
         if not 0 <= start < LARGEST_INDEX:
             raise InvalidInputError(f"capture {i} starts at sample {start} since 1970, more than 64 bits can count")
     rows = [
-        (start, end - capture.first_sample, capture.first_sample)
-        for start, capture, end in zip(timing.start_index, found, ends, strict=True)
+        (start, end - capture.first_sample, capture.first_sample, i)
+        for i, (start, capture, end) in enumerate(zip(timing.start_index, found, ends, strict=True))
         if end > capture.first_sample
     ]
     doubts = timing.doubts
@@ -262,13 +390,11 @@ def _segments(captures: list[dict[str, Any]], n_sample: int, rate: Fraction) -> 
             f"its metadata has {what}: when it was recorded is not known, nor how it lies to the other receivers",
             *doubts,
         ]
-    return np.array(rows, np.int64).reshape(-1, 3), doubts, time_known
+    return np.array(rows, np.int64).reshape(-1, 4), doubts, time_known
 
 
-def _capture(i: int, capture: dict[str, Any], rate: Fraction) -> Capture:
-    """Check what is used of a capture."""
-    if not isinstance(capture, dict):
-        raise InvalidInputError(f"capture {i} must be a JSON object, got {capture!r:.60}")
+def _capture(i: int, capture: dict[str, Any], rate: Fraction, *, offset: int) -> Capture:
+    """Check what is used of a capture; the file's first sample has the number ``offset``."""
     counts = []
     for name in ("core:sample_start", "core:global_index"):
         value = capture.get(name)
@@ -281,4 +407,7 @@ def _capture(i: int, capture: dict[str, Any], rate: Fraction) -> Capture:
             )
         counts.append(None if exact is None else int(exact))
     stamp = None if capture.get("core:datetime") is None else parse_stamp(capture["core:datetime"], rate)
-    return Capture(first_sample=counts[0] or 0, stamp=stamp, global_index=counts[1])
+    first = (counts[0] or 0) - offset
+    if first < 0:
+        raise InvalidInputError(f"capture {i} has a `core:sample_start` before `core:offset`, {offset}")
+    return Capture(first_sample=first, stamp=stamp, global_index=counts[1])

@@ -11,6 +11,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.recording.base import IndexArray, Recording, count_fill, frame_starts, own_frames, recorded_runs
+from rfpose.recording.parts import coverage
 from rfpose.recording.stamps import stamp_text
 from rfpose.scenario import Scenario
 
@@ -81,6 +82,7 @@ def describe(recording: Recording) -> dict[str, Any]:
     dict
         Ready for JSON: numbers, text, lists, None; no NaN or infinity. ``sound`` is true when ``problems``,
         a list of one-line texts, is empty. Levels are relative to full scale [dB], None where there is none.
+        ``parts``, of a recording of many, says who covers what; see `rfpose.recording.parts.coverage`.
         ``lost_samples`` are those that a receiver missed while others recorded; a pause of all is none.
     """
     problems = _Problems()
@@ -120,6 +122,8 @@ def describe(recording: Recording) -> dict[str, Any]:
         "provenance": recording.provenance,
     }
     summary |= _describe_time(recording, runs, starts, problems, all_readable=all_readable)
+    if recording.format == "parts":
+        summary["parts"] = coverage(recording)
     found = problems.lines()
     if scenario is not None:
         found += _disagreements(recording, scenario)
@@ -146,6 +150,8 @@ class _Problems:
 
     def of_doubts(self, recording: Recording) -> None:
         """Add what a recording itself doubts."""
+        for note in recording.notes:
+            self.add(note)
         for receiver_id, doubts in recording.doubts.items():
             for doubt in doubts:
                 self.of(receiver_id, doubt)

@@ -1,0 +1,325 @@
+"""Recordings of many parts: the same as the whole, whatever they were cut into; what does not fit is named."""
+
+import contextlib
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rfpose as rf
+from rfpose.errors import RecordingError
+from rfpose.recording import RecordingWriter, convert, describe, open_recording
+from rfpose.scenario import load_scenario
+
+SCENARIO = load_scenario(Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml")
+RATE = Fraction(10**7, 3)
+START = 1_790_000_000 * RATE.numerator // RATE.denominator
+
+
+def counts(n, seed=0):
+    return np.random.default_rng(seed).integers(-9000, 9000, size=(n, 2), dtype=np.int16)
+
+
+def write(path, pieces, **changes):
+    """Write a native file of pieces [(receiver, start after START, samples)]."""
+    settings = {
+        "scenario": None, "sample_rate": RATE, "centre_frequency_hz": 1e8, "sample_format": "int16",
+        "full_scale": 32767, "provenance": {},
+    } | changes  # fmt: skip
+    names = list(dict.fromkeys(name for name, _, _ in pieces))
+    with RecordingWriter(path, receiver_ids=names, **settings) as writer:
+        for name, start, samples in pieces:
+            writer.write(name, START + start, samples)
+    return path
+
+
+def part_of(source, path, receivers, start, end):
+    """Cut receivers and a stretch of time out of a recording, into a native file."""
+    with RecordingWriter(
+        path, scenario=source.scenario, receiver_ids=receivers, sample_rate=source.sample_rate,
+        centre_frequency_hz=source.centre_frequency_hz, sample_format=source.sample_format,
+        full_scale=source.full_scale, provenance={},
+    ) as writer:  # fmt: skip
+        for name in receivers:
+            for begin, count in source.blocks(name).tolist():
+                first, last = max(begin, start), min(begin + count, end)
+                if last > first:
+                    writer.write(name, first, source.read(name, first, last - first))
+        writer.write_truth(source.truth)
+    return path
+
+
+# -- the same poses as from the whole file -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A simulated recording of two mirrors in four bursts, and its result."""
+    site = SCENARIO.changed(
+        heliostat=SCENARIO.heliostat[:2], radio={"frame_samples": 8000},
+        simulation={"frame_count": 4, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0},
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("whole") / "whole.h5"
+    rf.simulate(site, seed=3).save(path)
+    return path, rf.process(path)
+
+
+def cut(path, folder, ways):
+    """Cut a recording by receiver (rows of ways) and time (columns), each piece into the format that stands there."""
+    given = []
+    with open_recording(path) as source:
+        names = np.array_split(np.array(source.receiver_ids), len(ways))
+        runs = source.blocks(source.receiver_ids[0])
+        for i, (row, formats) in enumerate(zip(names, ways, strict=True)):
+            # through the middle of a frame, as a recorder's clock happens to fall
+            edges = [int(runs[k * len(runs) // len(formats)].sum()) - 3000 for k in range(1, len(formats))]
+            edges = [0, *edges, 2**62]
+            for k, form in enumerate(formats):
+                piece = part_of(source, folder / f"p{i}_{k}.h5", row.tolist(), edges[k], edges[k + 1])
+                if form != "rfpose-iq":
+                    with open_recording(piece) as one:
+                        convert(one, folder / f"p{i}_{k}", format=form)
+                    piece = folder / f"p{i}_{k}"
+                given.append(piece)
+    return given
+
+
+@pytest.mark.parametrize(
+    "ways",
+    [
+        [["rfpose-iq"], ["rfpose-iq"], ["rfpose-iq"]],
+        [["rfpose-iq", "rfpose-iq", "rfpose-iq"]],
+        [["rfpose-iq", "rfpose-iq"], ["rfpose-iq"], ["rfpose-iq", "rfpose-iq", "rfpose-iq"]],
+        [["digital-rf", "sigmf"], ["rfpose-iq", "digital-rf"], ["sigmf"]],
+    ],
+    ids=["by receiver", "by time", "by both", "formats mixed"],
+)
+def test_the_same_result_comes_out_of_parts(whole, tmp_path, ways):
+    if any("rfpose-iq" not in form for row in ways for form in row):
+        pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
+        pytest.importorskip("sigmf", reason="the sigmf library is not installed")
+    path, wanted = whole
+    given = cut(path, tmp_path, ways)
+    assert len(given) == sum(map(len, ways))
+    with open_recording(path) as one, open_recording(given) as many:
+        assert set(many.receiver_ids) == set(one.receiver_ids)
+        for name in one.receiver_ids:
+            assert np.array_equal(many.blocks(name), one.blocks(name))
+            for start, count in one.blocks(name).tolist():
+                assert np.array_equal(many.read(name, start, count), one.read(name, start, count))
+        found = rf.process(many)
+    for table in ("poses", "fixes", "tones"):
+        mine, theirs = getattr(wanted, table), getattr(found, table)
+        for field in type(mine).__dataclass_fields__:
+            a, b = getattr(mine, field), getattr(theirs, field)
+            if isinstance(a, np.ndarray):
+                assert a.dtype == b.dtype
+                assert a.tobytes() == b.tobytes(), f"{table}.{field}"
+    assert found.truth is not None
+    assert found.truth.normal_enu.tobytes() == wanted.truth.normal_enu.tobytes()
+
+
+# -- what does not fit ---------------------------------------------------------------------------------------
+
+
+def test_parts_of_other_rates_and_tunings_are_refused_with_both_numbers(tmp_path):
+    a = write(tmp_path / "a.h5", [("r0", 0, counts(100))])
+    b = write(tmp_path / "b.h5", [("r1", 0, counts(100))], sample_rate=Fraction(2_000_000))
+    with pytest.raises(RecordingError, match=r"b.h5 was recorded at 2000000 samples/s, but a.h5 at 3333333.33333 \(1"):
+        open_recording([a, b])
+    c = write(tmp_path / "c.h5", [("r1", 0, counts(100))], centre_frequency_hz=1.2e8)
+    with pytest.raises(RecordingError, match=r"c.h5 is tuned to 120000000 Hz, but a.h5 to 100000000 Hz"):
+        open_recording([a, c])
+
+
+def test_parts_of_two_sites_are_refused(tmp_path):
+    other = SCENARIO.changed(transmitter=[*SCENARIO.transmitter[1:], SCENARIO.transmitter[0]])
+    a = write(tmp_path / "a.h5", [("r0", 0, counts(100))], scenario=SCENARIO)
+    b = write(tmp_path / "b.h5", [("r1", 0, counts(100))], scenario=other)
+    c = write(tmp_path / "c.h5", [("r2", 0, counts(100))])
+    with pytest.raises(RecordingError, match=r"a.h5 and b.h5 are of two sites: .* differ in `transmitter`"):
+        open_recording([a, b])
+    with open_recording([c, a]) as r:
+        assert r.scenario == SCENARIO
+    with open_recording([a, b], scenario=other) as r:
+        assert r.scenario == other
+
+
+def test_two_parts_that_claim_the_same_receiver_and_time(tmp_path):
+    x = counts(1000)
+    a = write(tmp_path / "a.h5", [("r0", 0, x)])
+    b = write(tmp_path / "b.h5", [("r0", 900, counts(500, seed=1))])
+    with pytest.raises(
+        RecordingError, match=r"a.h5 and b.h5 both claim to be receiver `r0` in 100 samples from .*2026"
+    ):
+        open_recording([a, b])
+    # a recorder whose files overlap says the same twice
+    c = write(tmp_path / "c.h5", [("r0", 900, np.concatenate([x[900:], counts(400, seed=2)]))])
+    with open_recording([a, c]) as r:
+        assert r.blocks("r0").tolist() == [[START, 1400]]
+        assert np.array_equal(r.read("r0", START, 1000), x)
+        assert "a.h5 and c.h5 both hold 100 samples from" in describe(r)["problems"][0]
+
+
+def test_a_part_that_is_missing_or_damaged_is_named_and_the_rest_goes_on(tmp_path):
+    x = counts(1000)
+    a = write(tmp_path / "a.h5", [("r0", 0, x)])
+    b = write(tmp_path / "b.h5", [("r1", 0, x)])
+    b.write_bytes(b.read_bytes()[:700])
+    with open_recording([a, b, tmp_path / "c.h5"]) as r:
+        assert r.receiver_ids == ("r0",)
+        assert np.array_equal(r.read("r0", START, 1000), x)
+        problems = describe(r)["problems"]
+    assert any("left out: " in line and "b.h5: the HDF5 file is truncated" in line for line in problems)
+    assert any("left out: " in line and "c.h5: no such file" in line for line in problems)
+    with pytest.raises(RecordingError, match=r"none of its 2 parts can be read: left out: .*b.h5"):
+        open_recording([b, tmp_path / "c.h5"])
+
+
+def test_a_gap_between_parts_is_told_where_others_recorded(tmp_path):
+    a = write(tmp_path / "a.h5", [("r0", 0, counts(1000)), ("r1", 0, counts(3000))])
+    b = write(tmp_path / "b.h5", [("r0", 1500, counts(1500)), ("r0", 9000, counts(100)), ("r1", 9000, counts(100))])
+    with open_recording([a, b]) as r:
+        (problem,) = (line for line in describe(r)["problems"] if "missing between" in line)
+    assert problem.startswith("r0: 500 samples (0.00015 s) are missing between a.h5 and b.h5")
+
+
+def test_parts_of_other_types_are_read_as_floats(tmp_path):
+    x = counts(300)
+    x[7] = -(2**15)
+    a = write(tmp_path / "a.h5", [("r0", 0, x)])
+    z = np.random.default_rng(1).normal(size=(300, 2)).astype(np.float32)
+    b = write(tmp_path / "b.h5", [("r0", 300, z)], sample_format="complex64", full_scale=np.inf)
+    with open_recording([a, b]) as r:
+        got = r.read("r0", START, 600)
+    assert got.dtype == np.float32
+    assert np.isnan(got[7]).all()
+    got[7] = x[7]
+    assert np.array_equal(got[:300], x)
+    assert np.array_equal(got[300:], z)
+
+
+def test_more_parts_than_may_be_open(tmp_path, monkeypatch):
+    monkeypatch.setattr("rfpose.recording.parts._OPEN_PARTS", 2)
+    x = counts(500)
+    given = [write(tmp_path / f"{k}.h5", [("r0", 100 * k, x[100 * k : 100 * k + 100])]) for k in range(5)]
+    with open_recording(given) as r:
+        assert np.array_equal(r.read("r0", START, 500), x)
+        assert np.array_equal(r.read("r0", START + 50, 400), x[50:450])
+        assert len(r._opened) == 2
+
+
+# -- directories and manifests -------------------------------------------------------------------------------
+
+
+def test_a_directory_of_parts(tmp_path):
+    x = counts(200)
+    write(tmp_path / "a.h5", [("r0", 0, x[:100])])
+    write(tmp_path / "b.h5", [("r0", 100, x[100:])])
+    (tmp_path / "notes.txt").write_text("x")
+    (tmp_path / "broken.h5").write_bytes(b"x")
+    with open_recording(tmp_path) as r:
+        assert r.path == tmp_path
+        assert np.array_equal(r.read("r0", START, 200), x)
+        summary = describe(r)
+    assert summary["format"] == "parts"
+    assert list(summary["parts"]) == ["a.h5", "b.h5"]
+    assert summary["parts"]["b.h5"]["samples"] == 100
+    assert summary["parts"]["b.h5"]["receivers"] == ["r0"]
+
+
+def manifest(folder, text):
+    (folder / "recording.toml").write_text('format = "rfpose-recording"\n' + text)
+    return folder / "recording.toml"
+
+
+def test_a_manifest_names_receivers_and_offsets(tmp_path):
+    x = counts(300)
+    write(tmp_path / "a.h5", [("rx", 0, x)])
+    write(tmp_path / "b.h5", [("rx", 0, x)])
+    write(tmp_path / "c.h5", [("rx", 0, x), ("ry", 0, x)])
+    (tmp_path / "site.toml").write_text(SCENARIO.to_toml())
+    path = manifest(
+        tmp_path,
+        """scenario = "site.toml"
+        [[part]]
+        files = "a.h5"
+        receivers = ["H01_r0"]
+        [[part]]
+        files = ["b*.h5", "none*.h5"]
+        receivers = { rx = "H01_r1" }
+        offset_s = -18
+        [[part]]
+        files = "c.h5"
+        receivers = { ry = "H01_r2", rz = "H01_r3" }
+        offset_s = 1e-3
+        """,
+    )
+    for given in (path, tmp_path):
+        with open_recording(given) as r:
+            assert r.receiver_ids == ("H01_r0", "H01_r1", "H01_r2")
+            assert r.scenario is not None
+            assert r.blocks("H01_r0").tolist() == [[START, 300]]
+            assert r.blocks("H01_r1").tolist() == [[START - 18 * 10**7 // 3, 300]]
+            assert r.blocks("H01_r2").tolist() == [[START + 3333, 300]]
+            assert np.array_equal(r.read("H01_r1", START - 60_000_000 + 5, 100), x[5:105])
+            assert any("`none*.h5` of recording.toml is missing" in note for note in r.notes)
+            assert any("c.h5 has no receiver `rz`" in note for note in r.notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "`part` must be one or more tables"),
+        ("[[part]]\nfile = 'a.h5'", r"unknown key `file` in part\[0\]; known: files"),
+        ("[[part]]\nfiles = []", r"part\[0\]: `files` must be names"),
+        ("[[part]]\nfiles = 'a.h5'\noffset_s = 'soon'", "`part.0.: offset_s` must be a number"),
+        ("[[part]]\nfiles = 'a.h5'\noffset_s = 1e12", "offset_s` must lie within"),
+        ("[[part]]\nfiles = 'a.h5'\nstart = '2026-02-30T00:00:00Z'", r"part\[0\]: `start`: .*no time of Unix"),
+        ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a/b']", "`receivers` may hold letters"),
+        ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a', 'a']", "`receivers` names one twice"),
+        ("[[part]]\nfiles = '../a.h5'", "outside the recording's folder"),
+        ("scenario = 5\n[[part]]\nfiles = 'a.h5'", "`scenario` must be the name of a file"),
+        ("[[part]]\nfiles = 'nothing.h5'", "none of its no parts can be read: `nothing.h5`"),
+    ],
+)
+def test_manifests_that_are_wrong(tmp_path, text, words):
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    for folder in (tmp_path, inner):
+        write(folder / "a.h5", [("rx", 0, counts(10))])
+    with pytest.raises(RecordingError, match=words) as caught:
+        open_recording(manifest(inner, text))
+    assert "recording.toml" in str(caught.value)
+
+
+def test_the_command_line_takes_parts(whole, tmp_path):
+    from click.testing import CliRunner
+
+    from rfpose.cli._app import app
+
+    path, wanted = whole
+    given = [str(one) for one in cut(path, tmp_path, [["rfpose-iq", "rfpose-iq"], ["rfpose-iq"]])]
+
+    def run(*words):
+        with contextlib.suppress(SystemExit):
+            found = CliRunner().invoke(app, list(words), catch_exceptions=False)
+        assert found.exit_code == 0, found.output
+        return found.stdout
+
+    told = json.loads(run("info", *given, "--json", "--picture", str(tmp_path / "c.svg")))
+    assert list(told["parts"]) == ["p0_0.h5", "p0_1.h5", "p1_0.h5"]
+    assert told["sound"]
+    drawn = (tmp_path / "c.svg").read_text()
+    assert all(name in drawn for name in told["receivers"])
+    assert "p1_0.h5" in run("info", *given)
+    run("convert", *given, "-o", str(tmp_path / "again.h5"))
+    with open_recording(path) as one, open_recording(tmp_path / "again.h5") as again:
+        for name in one.receiver_ids:
+            assert np.array_equal(again.blocks(name), one.blocks(name))
+    run("process", *given, "-o", str(tmp_path / "r.h5"))
+    found = rf.open_result(tmp_path / "r.h5")
+    assert found.poses.normal_enu.tobytes() == wanted.poses.normal_enu.tobytes()
+    assert found.settings["command"].startswith("rfpose process p0_0.h5 p0_1.h5 p1_0.h5 --estimator")
