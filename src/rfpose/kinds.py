@@ -46,13 +46,15 @@ def kind_of(path: str | Path) -> str | None:
     By what a file says of itself at its beginning; whether it is sound is for its reader to say.
     """
     path = Path(path)
-    if path.suffix in (".sigmf", ".sigmf-meta", ".sigmf-data"):
+    if path.suffix in (".sigmf", ".sigmf-meta", ".sigmf-data", ".sigmf-collection"):
         return "recording"
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD_BYTES)
     except (OSError, ValueError):
         return None
+    if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:12] == b"WAVE":
+        return "recording"
     if head.startswith(_HDF5):
         return _kind_of_hdf5(path)
     text = head.decode("utf-8-sig", errors="replace")

@@ -25,4 +25,6 @@ def members(path: Path) -> list[Path]:
         return [found for pattern in _IN_A_DIRECTORY for found in path.glob(pattern)]
     if path.suffix in (".sigmf-meta", ".sigmf-data"):
         return [path.with_suffix(".sigmf-meta"), path.with_suffix(".sigmf-data"), path.with_name(SCENARIO_FILE)]
+    if path.suffix == ".hdr":
+        return [path, path.with_suffix("")]
     return [path]

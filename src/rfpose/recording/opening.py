@@ -11,10 +11,13 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.kinds import kind_of
 from rfpose.recording.base import Recording
 from rfpose.recording.declared import Declared
+from rfpose.recording.gnuradio import GnuRadioRecording, is_gnuradio_header
 from rfpose.recording.manifest import MANIFEST_FILE, is_manifest, read_manifest
 from rfpose.recording.members import members
 from rfpose.recording.native import NativeRecording
 from rfpose.recording.parts import Part, PartsRecording
+from rfpose.recording.raw import RawRecording
+from rfpose.recording.wav import WavRecording, is_wav
 from rfpose.scenario import Scenario, load_scenario
 
 __all__ = ["RecordingSource", "files_of", "open_recording"]
@@ -121,6 +124,14 @@ def _refuse_missing(path: Path) -> None:
 def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | None, follow_links: bool) -> Recording:
     """Open what is one recording in one format."""
     _refuse_missing(path)
+    if declared is not None and declared.format == "raw":
+        return RawRecording(path, scenario=scenario, declared=declared)
+    if declared is not None or is_wav(path):
+        return WavRecording(path, scenario=scenario, declared=declared, follow_links=follow_links)
+    header = path if path.suffix == ".hdr" else path.with_name(f"{path.name}.hdr")
+    if is_gnuradio_header(header) or is_gnuradio_header(path):
+        one = header if is_gnuradio_header(header) else path
+        return GnuRadioRecording(one, scenario=scenario, follow_links=follow_links)
     if path.is_dir():
         return _open_directory(path, scenario, follow_links=follow_links)
     if path.suffix in _SIGMF_SUFFIXES:
@@ -167,7 +178,11 @@ def _found_in(path: Path) -> list[Path]:
 
 def _is_part(file: Path) -> bool:
     """Whether a file in a directory is a recording, and not a result or something else of the same ending."""
-    return file.is_file() and (file.suffix not in (".h5", ".hdf5") or kind_of(file) == "recording")
+    if not file.is_file():
+        return False
+    if file.suffix == ".hdr":
+        return is_gnuradio_header(file)
+    return file.suffix not in (".h5", ".hdf5") or kind_of(file) == "recording"
 
 
 def _open_set(

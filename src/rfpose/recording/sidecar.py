@@ -1,14 +1,15 @@
-"""The scenario beside a recording whose format has no place for it."""
+"""What a recording whose format has no place for it takes from beside: the scenario, the receiver's name."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Final
 
 from rfpose.recording.links import refuse_outside
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import MAX_ID_LENGTH, Scenario, load_scenario
 
-__all__ = ["SCENARIO_FILE", "load_sidecar_scenario"]
+__all__ = ["SCENARIO_FILE", "load_sidecar_scenario", "receiver_name"]
 
 SCENARIO_FILE: Final = "scenario.toml"
 
@@ -31,3 +32,8 @@ def load_sidecar_scenario(directory: Path, *, follow_links: bool) -> Scenario | 
     if not follow_links:
         refuse_outside(directory, path, named_by=path)
     return load_scenario(path)
+
+
+def receiver_name(text: str) -> str:
+    """Return a receiver's name out of a file's: what no name may hold becomes an underscore."""
+    return re.sub(r"[^A-Za-z0-9_.\-]", "_", text)[:MAX_ID_LENGTH] or "receiver"

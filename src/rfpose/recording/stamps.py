@@ -26,6 +26,8 @@ _ON_GRID: Final = Fraction(1, 100)
 """Of a sample. A stamp closer to the grid than this, or than its last digit, lies on it."""
 _SIGMAS: Final = 6
 """A stamp this many standard deviations of all stamps beside their line is no scatter."""
+_WORST_S: Final = Fraction(1, 10)
+"""Stamps that scatter by more [s], and by more than their last digit, are no stamps."""
 _SIGMA_OF_MAD: Final = Fraction(14826, 10000)
 _FEWEST_STEPS: Final = 3
 """Fewer cannot tell a clock, which moves all stamps, from lost samples, which move those after them."""
@@ -170,7 +172,9 @@ def _positions(captures: Sequence[Capture], doubts: list[str]) -> list[int]:
                         "clock; so few time stamps cannot tell"
                     )
             elif following[0] < -(limit + room):
-                raise _too_early(i, round(-following[0]))
+                if statistics.median_low(following) < -(limit + room):
+                    raise _too_early(i, round(-following[0]))
+                doubts.append(f"the time stamp of capture {i} lies {round(-following[0])} samples too early, alone")
         position.append(begin)
     return position
 
@@ -229,6 +233,11 @@ def _clock(captures: Sequence[Capture], position: Sequence[int], rate: Fraction)
             f"its time stamps say that its clock runs {float(abs(slope)) * 1e6:.3g} ppm "
             f"{'slow' if slope > 0 else 'fast'}: counted by the nominal rate, sample times are wrong by up to "
             f"{_in_words(drift, rate)}"
+        )
+    if scatter > coarse and scatter > _WORST_S * rate:
+        raise InvalidInputError(
+            f"its time stamps scatter by {_in_words(scatter, rate)} about its samples' times: they tell no time; "
+            "correct or remove them"
         )
     if scatter > coarse:
         doubts.append(f"its time stamps scatter by {_in_words(scatter, rate)} about its samples' times")
