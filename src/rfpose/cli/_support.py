@@ -12,13 +12,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import click
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
 from rfpose.shown import plain
+
+if TYPE_CHECKING:
+    from rfpose.recording.declared import Declared
 
 __all__ = [
     "CommonOptions",
@@ -30,6 +33,7 @@ __all__ = [
     "check_table",
     "check_there",
     "common_options",
+    "declared_options",
     "emit_json",
     "examples",
     "follow_links_option",
@@ -119,6 +123,55 @@ def gathered(parameter: str, record: type) -> Callable[[F], F]:
         return cast(F, called)
 
     return decorate
+
+
+def declared_options(function: F) -> F:
+    """Add what files of samples do not say of themselves; the command gets it as one argument, ``declared``."""
+
+    @functools.wraps(function)
+    def command(*args: Any, **given: Any) -> Any:
+        names = ("file_format", "sample_type", "rate", "start", "centre", "receiver")
+        return function(*args, declared=_declared(**{name: given.pop(name) for name in names}), **given)
+
+    added: Any = command
+    for option in (
+        click.option("--receiver", multiple=True, help="With --format: the receiver's name; once for each, in order."),
+        click.option("--centre", help="With --format: radio frequency at baseband zero, Hz."),
+        click.option("--start", help="With --format: when the first sample was taken, as 2026-09-21T14:00:00.123Z."),
+        click.option("--rate", help="With --format: samples a second, also as a fraction: 10000000/3."),
+        click.option("--sample-type", help="With --format: ci8, cu8, ci16_le, ci16_be, ci32_le, cf32_le and so on."),
+        click.option(
+            "--format",
+            "file_format",
+            type=click.Choice(("raw", "wav")),
+            help="The files are raw interleaved IQ, or WAV; the next options say what they do not say of themselves.",
+        ),
+    ):
+        added = option(added)
+    return cast(F, added)
+
+
+def _declared(
+    file_format: Any, sample_type: str | None, rate: str | None, start: str | None, centre: str | None, receiver: Any
+) -> Declared | None:
+    """Return what the options say of files of samples; None where nothing is said."""
+    told = {"--sample-type": sample_type, "--rate": rate, "--start": start, "--centre": centre, "--receiver": receiver}
+    if file_format is None:
+        if lone := [name for name, value in told.items() if value]:
+            raise InvalidInputError(f"{lone[0]} goes with --format raw or --format wav")
+        return None
+    from rfpose.foreign import exact_number, exact_rate
+    from rfpose.recording.declared import Declared, seconds_of
+
+    exact = None if rate is None else exact_number("rate", rate)
+    return Declared(
+        format=file_format,
+        sample_type=sample_type,
+        sample_rate=None if exact is None else exact_rate("rate", exact),
+        start_s=None if start is None else seconds_of(start, "`start`"),
+        centre_frequency_hz=None if centre is None else float(exact_number("centre", centre)),
+        receiver_ids=tuple(receiver),
+    )
 
 
 def examples(*lines: str) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from rfpose.cli._support import (
     common_options,
+    declared_options,
     emit_json,
     examples,
     follow_links_option,
@@ -18,6 +19,9 @@ from rfpose.cli._support import (
     say,
     wants_json,
 )
+
+if TYPE_CHECKING:
+    from rfpose.recording.declared import Declared
 
 __all__ = ["FORMAT_NAMES", "command"]
 
@@ -30,6 +34,7 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
     epilog=examples(
         "rfpose convert measured/drf -o recording.h5 --scenario site.toml",
         "rfpose convert recording.h5 -o measured/drf --to digital-rf",
+        "rfpose convert h01.iq -o h01.h5 --format raw --sample-type ci16_le --rate 4e7 --start 2026-09-21T14:00:00Z",
     ),
 )
 @click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -38,11 +43,18 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
     "--to", "format_name", type=click.Choice(FORMAT_NAMES), default="rfpose-iq", show_default=True, help="Format."
 )
 @click.option("--scenario", type=click.Path(path_type=Path), help="Site description to go with it.")
+@declared_options
 @follow_links_option
 @force_option
 @common_options
 def command(
-    recording: tuple[Path, ...], output: Path, format_name: Any, scenario: Path | None, follow_links: bool, force: bool
+    recording: tuple[Path, ...],
+    output: Path,
+    format_name: Any,
+    scenario: Path | None,
+    declared: Declared | None,
+    follow_links: bool,
+    force: bool,
 ) -> None:
     """Write a recording in another format; samples, times and gaps stay exactly as they are."""
     directories = format_name != FORMAT_NAMES[0]
@@ -52,7 +64,7 @@ def command(
         from rfpose.scenario import load_scenario
 
         given = None if scenario is None else load_scenario(scenario)
-        with open_recording(recording, scenario=given, follow_links=follow_links) as source:
+        with open_recording(recording, scenario=given, declared=declared, follow_links=follow_links) as source:
             convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
             found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
     if wants_json():

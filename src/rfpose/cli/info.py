@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,6 +12,7 @@ from rfpose.cli._support import (
     check_ending,
     check_there,
     common_options,
+    declared_options,
     emit_json,
     examples,
     follow_links_option,
@@ -23,6 +24,9 @@ from rfpose.cli._support import (
 )
 from rfpose.errors import InvalidInputError
 from rfpose.kinds import kind_of
+
+if TYPE_CHECKING:
+    from rfpose.recording.declared import Declared
 
 __all__ = ["command"]
 
@@ -50,10 +54,13 @@ _EACH = 20
 @click.option(
     "--picture", type=click.Path(path_type=Path), help="Draw a scenario's site, or who recorded when: .png, .svg, .pdf."
 )
+@declared_options
 @follow_links_option
 @force_option
 @common_options
-def command(file: tuple[Path, ...], picture: Path | None, follow_links: bool, force: bool) -> None:
+def command(
+    file: tuple[Path, ...], picture: Path | None, declared: Declared | None, follow_links: bool, force: bool
+) -> None:
     """Say what a recording, a result, a tracking run, a scenario or a file of mounts holds and whether it is sound.
 
     Several files are the parts of one recording. Of a scenario also draw the site, in letters or with --picture; of a
@@ -65,7 +72,7 @@ def command(file: tuple[Path, ...], picture: Path | None, follow_links: bool, fo
         check_there(given)
     from rfpose.pipeline.inspect import inspect_file
 
-    found = inspect_file(given, follow_links=follow_links)
+    found = inspect_file(given, declared=declared, follow_links=follow_links)
     is_site = found["kind"] == "scenario"
     if picture is not None:
         if found["kind"] not in ("scenario", "recording"):
@@ -74,7 +81,7 @@ def command(file: tuple[Path, ...], picture: Path | None, follow_links: bool, fo
                 "draws it"
             )
         with outputs(picture, inputs=file, force=force):
-            _draw(given, picture, follow_links=follow_links)
+            _draw(given, picture, declared=declared, follow_links=follow_links)
     if wants_json():
         emit_json(found if picture is None else {**found, "picture": picture})
         return
@@ -91,10 +98,10 @@ def command(file: tuple[Path, ...], picture: Path | None, follow_links: bool, fo
         say(f"wrote {picture}")
 
 
-def _draw(given: Path | tuple[Path, ...], picture: Path, *, follow_links: bool) -> None:
+def _draw(given: Path | tuple[Path, ...], picture: Path, *, declared: Declared | None, follow_links: bool) -> None:
     from rfpose.drawing import save_figure
 
-    if isinstance(given, Path) and given.suffix == ".toml" and kind_of(given) != "recording":
+    if declared is None and isinstance(given, Path) and given.suffix == ".toml" and kind_of(given) != "recording":
         from rfpose.pipeline.pictures.site import site_plan
         from rfpose.scenario import load_scenario
 
@@ -102,7 +109,7 @@ def _draw(given: Path | tuple[Path, ...], picture: Path, *, follow_links: bool) 
         return
     from rfpose.recording import open_recording
 
-    with open_recording(given, follow_links=follow_links) as recording:
+    with open_recording(given, declared=declared, follow_links=follow_links) as recording:
         save_figure(recording.plot_coverage(), picture)
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +15,7 @@ from rfpose.cli._support import (
     CommonOptions,
     check_table,
     common_options,
+    declared_options,
     emit_json,
     examples,
     follow_links_option,
@@ -25,6 +27,9 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
+
+if TYPE_CHECKING:
+    from rfpose.recording.declared import Declared
 
 __all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "REFLECTION_NAMES", "command"]
 
@@ -110,6 +115,7 @@ class _Tables:
 @click.option("--csv", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
 @click.option("--profile", is_flag=True, help="Also tell the seconds of each stage, and what takes longest.")
+@declared_options
 @follow_links_option
 @force_option
 @common_options
@@ -124,6 +130,7 @@ def command(
     how: _How,
     tables: _Tables,
     profile: bool,
+    declared: Declared | None,
     follow_links: bool,
     force: bool,
 ) -> None:
@@ -137,10 +144,15 @@ def command(
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
     claimed = outputs(output, tables.csv, tables.parquet, inputs=[*recording, scenario, how.survey], force=force)
-    with claimed, progress("Measuring") as on_progress:
+    with claimed, progress("Measuring") as on_progress, contextlib.ExitStack() as open_files:
         check_table(tables.parquet, ".parquet")
+        given: Any = recording
+        if declared is not None:
+            given = open_files.enter_context(
+                rfpose.open_recording(recording, declared=declared, follow_links=follow_links)
+            )
         result = rfpose.process(
-            recording,
+            given,
             output,
             scenario=scenario,
             **asdict(how),

@@ -9,7 +9,7 @@ from typing import Any
 
 from rfpose.errors import GeometryError, RecordingError, ScenarioError
 from rfpose.kinds import kind_of
-from rfpose.recording import RecordingSource, describe, open_recording
+from rfpose.recording import Declared, RecordingSource, describe, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
 # each kind loads its reader when one of it is there: a reader of results or runs takes longer to load than to read
@@ -17,14 +17,16 @@ from rfpose.scenario import Scenario, load_scenario
 __all__ = ["inspect_file"]
 
 
-def inspect_file(path: RecordingSource, *, follow_links: bool = False) -> dict[str, Any]:
+def inspect_file(
+    path: RecordingSource, *, declared: Declared | None = None, follow_links: bool = False
+) -> dict[str, Any]:
     """Describe a recording, a result, a tracking run, a scenario, mounts or an antenna pattern, ready for JSON.
 
     Parameters
     ----------
     path
         The file, or a recording's directory; several are the parts of one recording.
-    follow_links
+    declared, follow_links
         As for `rfpose.recording.open_recording`.
 
     Returns
@@ -38,8 +40,8 @@ def inspect_file(path: RecordingSource, *, follow_links: bool = False) -> dict[s
     RecordingError, ScenarioError
         The file is missing, damaged or none of these.
     """
-    if not isinstance(path, str | Path):
-        return _recording(path, follow_links=follow_links)
+    if declared is not None or not isinstance(path, str | Path):
+        return _recording(path, declared=declared, follow_links=follow_links)
     path = Path(path)
     kind = kind_of(path)
     readers = {"antenna": _antenna, "model": _models, "result": _result, "survey": _survey, "track": _track}
@@ -49,11 +51,11 @@ def inspect_file(path: RecordingSource, *, follow_links: bool = False) -> dict[s
         raise RecordingError(f"{path}: a truth, which `rfpose evaluate` takes; give it there beside its result")
     if kind == "scenario" or (kind is None and path.suffix == ".toml"):
         return {"kind": "scenario", "path": str(path), **_scenario(load_scenario(path))}
-    return _recording(path, follow_links=follow_links)
+    return _recording(path, declared=None, follow_links=follow_links)
 
 
-def _recording(path: RecordingSource, *, follow_links: bool) -> dict[str, Any]:
-    with open_recording(path, follow_links=follow_links) as recording:
+def _recording(path: RecordingSource, *, declared: Declared | None, follow_links: bool) -> dict[str, Any]:
+    with open_recording(path, declared=declared, follow_links=follow_links) as recording:
         return {"kind": "recording", **describe(recording)}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import threading
@@ -16,7 +17,7 @@ from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhas
 from rfpose.pipeline._workers import worker_pool
 from rfpose.pipeline.formats.journal import Entry, Journal
 from rfpose.pipeline.stages import Stopwatch
-from rfpose.recording import Recording
+from rfpose.recording import GapError, Recording
 from rfpose.scenario import Scenario
 
 __all__ = ["JOURNAL_SAMPLES", "journal_key", "measure_tones"]
@@ -50,8 +51,9 @@ def _fingerprint(recording: Recording) -> str:
         found.update(np.ascontiguousarray(blocks, "<i8").tobytes())
         for start, count in blocks[[0, -1]] if len(blocks) else ():
             n = min(int(count), _PROBE_SAMPLES)
-            found.update(recording.read(receiver_id, int(start), n).tobytes())
-            found.update(recording.read(receiver_id, int(start + count) - n, n).tobytes())
+            for at in (int(start), int(start + count) - n):
+                with contextlib.suppress(GapError):  # a damaged part
+                    found.update(recording.read(receiver_id, at, n).tobytes())
     return found.hexdigest()
 
 
@@ -170,7 +172,10 @@ class _Reader:
             begin = self._recording.frame_at(receiver_id, start, self._n_sample)
             if begin is None:
                 return LineStatus.GAP
-            return self._recording.read(receiver_id, begin, self._n_sample, out=self._buffer())
+            try:
+                return self._recording.read(receiver_id, begin, self._n_sample, out=self._buffer())
+            except GapError:  # of a part that is damaged, which is said; the rest goes on
+                return LineStatus.GAP
 
     def _buffer(self) -> Samples:
         if not hasattr(self._own, "buffer"):

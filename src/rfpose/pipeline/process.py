@@ -27,6 +27,7 @@ from rfpose.recording import (
     note_doubts,
     open_recording,
 )
+from rfpose.recording.parts import PartsRecording
 from rfpose.scenario import Scenario, scenario_of
 
 if TYPE_CHECKING:
@@ -125,6 +126,11 @@ def process(
                     surveyed = read_survey(survey)
                     site = surveyed.applied(site)
                 check_against(opened, site)
+                if isinstance(opened, PartsRecording):
+                    from rfpose.pipeline.clocks import settle_clocks
+
+                    opened = settle_clocks(opened, site)
+                    open_files.callback(opened.close)
                 starts = _frames(opened, site)
                 # compiled code, which none of the refusals above should wait for
                 from rfpose.dsp import ESTIMATORS

@@ -118,6 +118,7 @@ class PartsRecording(Recording):
         self._broken: dict[int, str] = {}
         self._known: list[_Known] = []
         self._site = scenario
+        self._given, self._given_notes = list(parts), list(notes)
         notes = list(notes)
         try:
             self._look_at(parts, notes)
@@ -159,6 +160,24 @@ class PartsRecording(Recording):
         """Close the parts that are open."""
         while self._opened:
             self._opened.popitem()[1].close()
+
+    def moved(self, offset_s: Mapping[str, Fraction], notes: Sequence[str]) -> PartsRecording:
+        """Return the same with the clocks of parts, by name, set right; the parts are opened anew.
+
+        Parameters
+        ----------
+        offset_s
+            What is to be added to a part's time besides [s].
+        notes
+            What is to be told of it.
+        """
+        parts = [
+            dataclasses.replace(part, offset_s=part.offset_s + offset_s.get(part.name, 0), find_offset=False)
+            for part in self._given
+        ]
+        return PartsRecording(
+            self.path, parts, names=self.names, scenario=self.scenario, notes=[*self._given_notes, *notes]
+        )
 
     # -- putting together --------------------------------------------------------------------------------
 
@@ -361,6 +380,11 @@ class PartsRecording(Recording):
         with contextlib.suppress(ValueError):
             return stamp_text(index, self.sample_rate)[:-4] + "Z"
         return "?"
+
+    @property
+    def sought(self) -> tuple[str, ...]:
+        """Names of parts whose offset in time is to be found."""
+        return tuple(known.part.name for known in self._known if known.part.find_offset)
 
     def parts(self) -> Iterator[tuple[str, Recording, dict[str, IndexArray]]]:
         """Yield each part's name, what was opened for it, and (block, 2) rows by receiver, in the whole's indices."""
