@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from rfpose.cli._app import app
-from rfpose.cli.convert import FORMAT_NAMES
+from rfpose.cli.convert import COMPRESSION_NAMES, FORMAT_NAMES
 from rfpose.cli.demo import write_report
 from rfpose.drawing import save_figure
 from rfpose.pipeline.demo import run_demo, shipped_scenario
@@ -21,6 +21,7 @@ from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result_file import open_result
 from rfpose.recording import open_recording
 from rfpose.recording.base import WrittenFormat
+from rfpose.recording.writer import COMPRESSIONS
 from rfpose.scenario import Scenario, load_scenario
 from told import undocumented, unseen
 
@@ -119,6 +120,7 @@ def test_convert_there_and_back(directory: Path, tmp_path: Path) -> None:
 
 def test_format_names_are_those_of_recording() -> None:
     assert set(FORMAT_NAMES) == set(get_args(WrittenFormat))
+    assert COMPRESSION_NAMES == COMPRESSIONS
 
 
 @pytest.mark.parametrize(

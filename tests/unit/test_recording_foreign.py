@@ -1,5 +1,6 @@
 """Digital RF and SigMF, written by their own libraries, and conversion between all formats."""
 
+import hashlib
 import json
 import math
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.recording import GapError, RecordingWriter, convert, count_fill, describe, open_recording
+from rfpose.recording import GapError, Recording, RecordingWriter, convert, count_fill, describe, open_recording
 from rfpose.scenario import load_scenario
 
 drf = pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
@@ -524,3 +525,35 @@ def test_interrupted_conversion_leaves_nothing(native, tmp_path):
         with pytest.raises(KeyboardInterrupt):
             convert(native, tmp_path / "out", format=format, on_progress=stop)
     assert [p.name for p in tmp_path.iterdir()] == ["native.h5"]
+
+
+@pytest.mark.parametrize("format", ["rfpose-iq", "digital-rf", "sigmf"])
+def test_conversion_is_checksummed_and_read_back(native, tmp_path, format, monkeypatch):
+    wanted = {
+        name: hashlib.sha256(
+            b"".join(native.read(name, start, count).tobytes() for start, count in native.blocks(name).tolist())
+        ).hexdigest()
+        for name in native.receiver_ids
+    }
+    assert convert(native, tmp_path / "out", format=format) == wanted
+    if format == "sigmf":
+        for meta in (tmp_path / "out").glob("*.sigmf-meta"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                sigmf.fromfile(meta, skip_checksum=False)  # raises where the checksum is wrong
+            assert "core:sha512" in json.loads(meta.read_text())["global"]
+    # a disk that gives back something else
+    plain = Recording.read
+
+    def read(self, receiver_id, start, count, out=None):
+        found = plain(self, receiver_id, start, count, out)
+        if self is not native:
+            found[-1] += 1
+        return found
+
+    monkeypatch.setattr(Recording, "read", read)
+    with pytest.raises(RecordingError, match=r"out2: what was written of receiver .* reads back as something else"):
+        convert(native, tmp_path / "out2", format=format)
+    assert not (tmp_path / "out2").exists()
+    with pytest.raises(InvalidInputError, match="`compress` is for rfpose-iq"):
+        convert(native, tmp_path / "out3", format="sigmf", compress="blosc2")

@@ -11,6 +11,7 @@ import pytest
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.recording import GapError, RecordingWriter, count_fill, frame_starts, open_recording, recorded_runs
+from rfpose.recording.writer import COMPRESSIONS
 from rfpose.scenario import load_scenario
 from rfpose.truth import Truth
 
@@ -379,3 +380,32 @@ def test_memory_stays_small_on_a_recording_of_many_gigabytes(tmp_path):
         r.read("a", int(starts[-2]), take, out=buffer)
         assert np.all(buffer == r.fill_value)
         assert process.memory_info().rss - before < 50e6
+
+
+@pytest.mark.parametrize("compress", COMPRESSIONS)
+def test_compressed_reads_the_same(tmp_path, compress):
+    pytest.importorskip("hdf5plugin", reason="the hdf5plugin library is not installed")
+    x = (np.random.default_rng(0).normal(size=(400_000, 2)) * 20).astype(np.int16)
+    sizes = {}
+    for name, how in (("plain", None), ("small", compress), ("again", compress)):
+        with RecordingWriter(
+            tmp_path / name, scenario=None, receiver_ids=["a"], sample_rate=Fraction(10**6), centre_frequency_hz=1e8,
+            sample_format="int16", full_scale=32767, provenance={}, compress=how,
+        ) as writer:  # fmt: skip
+            writer.write("a", 1000, x[:250_000])
+            writer.write("a", 300_000, x[250_000:])
+        sizes[name] = (tmp_path / name).stat().st_size
+    with open_recording(tmp_path / "small") as r:
+        assert r.blocks("a").tolist() == [[1000, 250_000], [300_000, 150_000]]
+        assert np.array_equal(r.read("a", 1000, 250_000), x[:250_000])
+        assert np.array_equal(r.read("a", 300_123, 100_000), x[250_123:350_123])
+    assert sizes["small"] < 0.6 * sizes["plain"]
+    assert (tmp_path / "small").read_bytes() == (tmp_path / "again").read_bytes()
+
+
+def test_compression_that_is_not_known(tmp_path):
+    with pytest.raises(InvalidInputError, match="`compress` must be one of bitshuffle-zstd"):
+        RecordingWriter(
+            tmp_path / "x.h5", scenario=None, receiver_ids=["a"], sample_rate=Fraction(1), centre_frequency_hz=None,
+            sample_format="int16", full_scale=1, provenance={}, compress="zip",
+        )  # fmt: skip

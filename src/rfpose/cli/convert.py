@@ -23,10 +23,11 @@ from rfpose.cli._support import (
 if TYPE_CHECKING:
     from rfpose.recording.declared import Declared
 
-__all__ = ["FORMAT_NAMES", "command"]
+__all__ = ["COMPRESSION_NAMES", "FORMAT_NAMES", "command"]
 
 # Written out so that --help need not load h5py; a test holds them to rfpose.recording.
 FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
+COMPRESSION_NAMES = ("bitshuffle-zstd", "bitshuffle-lz4", "blosc2")
 
 
 @click.command(
@@ -42,6 +43,14 @@ FORMAT_NAMES = ("rfpose-iq", "digital-rf", "sigmf")
 @click.option(
     "--to", "format_name", type=click.Choice(FORMAT_NAMES), default="rfpose-iq", show_default=True, help="Format."
 )
+@click.option(
+    "--compress",
+    type=click.Choice(COMPRESSION_NAMES),
+    help="Of rfpose-iq: make it smaller without loss. [default: not]",
+)
+@click.option(
+    "--verify/--no-verify", default=True, show_default=True, help="Read what was written, and compare checksums."
+)
 @click.option("--scenario", type=click.Path(path_type=Path), help="Site description to go with it.")
 @declared_options
 @follow_links_option
@@ -51,6 +60,8 @@ def command(
     recording: tuple[Path, ...],
     output: Path,
     format_name: Any,
+    compress: str | None,
+    verify: bool,
     scenario: Path | None,
     declared: Declared | None,
     follow_links: bool,
@@ -60,13 +71,27 @@ def command(
     directories = format_name != FORMAT_NAMES[0]
     claimed = outputs(output, inputs=[*recording, scenario], force=force, directories=directories)
     with claimed, progress("Converting") as on_progress:
-        from rfpose.recording import convert, open_recording
+        from rfpose.recording import convert, note_doubts, open_recording
         from rfpose.scenario import load_scenario
 
         given = None if scenario is None else load_scenario(scenario)
         with open_recording(recording, scenario=given, declared=declared, follow_links=follow_links) as source:
-            convert(source, output, format=format_name, overwrite=force, on_progress=on_progress)
-            found = {"recording": output, "format": format_name, "receivers": len(source.receiver_ids)}
+            digests = convert(
+                source,
+                output,
+                format=format_name,
+                overwrite=force,
+                compress=compress,
+                verify=verify,
+                on_progress=on_progress,
+            )
+            note_doubts(source)
+            found = {
+                "recording": output,
+                "format": format_name,
+                "receivers": len(source.receiver_ids),
+                "sha256": digests,
+            }
     if wants_json():
         emit_json(found)
     else:

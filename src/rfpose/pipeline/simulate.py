@@ -101,11 +101,12 @@ class SimulatedRecording(Recording):
         *,
         format: str = "rfpose-iq",
         force: bool = False,
+        compress: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Write the recording, with scenario and truth; see `Recording.save`."""
         if format != "rfpose-iq":
-            super().save(path, format=format, force=force, on_progress=on_progress)
+            super().save(path, format=format, force=force, compress=compress, on_progress=on_progress)
             return
         path, done = Path(path), 0
         with claim(path, inputs=self._made_from, force=force):
@@ -119,6 +120,7 @@ class SimulatedRecording(Recording):
                 full_scale=self.full_scale,
                 provenance=self.provenance,
                 overwrite=True,
+                compress=compress,
             )
             with writer:
                 for chunk in self._simulator:

@@ -209,6 +209,7 @@ class Recording(ABC):
         *,
         format: str = "rfpose-iq",
         force: bool = False,
+        compress: str | None = None,
         on_progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Write the recording in one of the known formats.
@@ -217,7 +218,7 @@ class Recording(ABC):
         ----------
         path
             File (rfpose-iq) or directory (the others) to make.
-        format, on_progress
+        format, compress, on_progress
             As for `rfpose.recording.convert`.
         force
             Overwrite what exists.
@@ -231,7 +232,7 @@ class Recording(ABC):
         """
         from rfpose.recording.conversion import convert
 
-        convert(self, path, format=format, overwrite=force, on_progress=on_progress)
+        convert(self, path, format=format, overwrite=force, compress=compress, on_progress=on_progress)
 
     def plot(self, *, receiver_id: str | None = None) -> Figure:
         """Draw the spectrum of one receiver's first whole frame, by default the first's, with every line marked.

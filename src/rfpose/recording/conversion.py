@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import logging
 import os
@@ -40,9 +41,11 @@ def convert(
     *,
     format: str,
     overwrite: bool = False,
+    compress: str | None = None,
+    verify: bool = True,
     on_progress: Callable[[int, int], None] | None = None,
-) -> None:
-    """Write a recording in another format.
+) -> dict[str, str]:
+    """Write a recording in another format, and read it back.
 
     Samples, their times and gaps, rate and tuning are kept exactly. rfpose-iq keeps scenario, truth and
     provenance too; the other two get the scenario as a file ``scenario.toml`` beside the receivers, where
@@ -58,26 +61,42 @@ def convert(
         ``"rfpose-iq"``, ``"digital-rf"`` or ``"sigmf"``.
     overwrite
         Replace an existing recording, in one step. A directory that holds anything else is never replaced.
+    compress
+        Of rfpose-iq, one of `rfpose.recording.writer.COMPRESSIONS`; None: not compressed.
+    verify
+        Read what was written, and compare its checksums with those of what was read.
     on_progress
         Called with samples done and samples in all, over all receivers.
+
+    Returns
+    -------
+    dict
+        SHA-256 of each receiver's samples (int16 or float32, little-endian, I and Q in turn), in order of time.
 
     Raises
     ------
     InvalidInputError
-        Unknown ``format``.
+        Unknown ``format`` or ``compress``, or a format that knows no compression.
+    RecordingError
+        What was written reads back as something else.
     RecordingError
         The target exists, is or holds what is read, or cannot be written; the format's library is missing; the source
         is damaged.
     """
     if format not in get_args(WrittenFormat):
         raise InvalidInputError(f"`format` must be one of {', '.join(get_args(WrittenFormat))}, got {format!r}")
+    if compress is not None and format != "rfpose-iq":
+        raise InvalidInputError(f"`compress` is for rfpose-iq, {format} has no place for it")
     target = Path(target_path)
+    digests = _Digests()
     inputs = source.files()
     if format == "rfpose-iq":
-        with claim(target, inputs=inputs, force=overwrite):
+        with claim(target, inputs=inputs, force=overwrite) as job:
             _refuse_small_disk(source, target)
-            _to_native(source, target, on_progress)
-        return
+            _to_native(source, target, on_progress, compress=compress, digests=digests)
+            if verify:
+                _verify(job.part(target), target, digests)
+        return digests.found()
     stream_writer = _DigitalRfStream if format == "digital-rf" else _SigmfStream
     with claim(target, inputs=inputs, force=overwrite, directories=True) as job:
         if target.exists():
@@ -88,8 +107,43 @@ def convert(
             _log.warning("%s: %s has no place for the truth of a simulation; it is left out", target, format)
         with _library_errors(target):
             job.part(target).mkdir()
-            _to_directory(source, job.part(target), stream_writer, on_progress)
+            _to_directory(source, job.part(target), stream_writer, on_progress, digests=digests)
+        if verify:
+            _verify(job.part(target), target, digests)
         job.complete(target)
+    return digests.found()
+
+
+class _Digests:
+    """Checksums of receivers' samples."""
+
+    def __init__(self) -> None:
+        self._hashes: dict[str, Any] = {}
+
+    def add(self, receiver_id: str, samples: IqArray) -> None:
+        """Take the next samples of a receiver."""
+        self._hashes.setdefault(receiver_id, hashlib.sha256()).update(np.ascontiguousarray(samples).data)
+
+    def found(self) -> dict[str, str]:
+        """Return the checksum of each receiver."""
+        return {name: found.hexdigest() for name, found in self._hashes.items()}
+
+
+def _verify(written: Path, target: Path, digests: _Digests) -> None:
+    """Raise unless what stands on the disk reads as what was written."""
+    from rfpose.recording.opening import open_recording
+
+    again = _Digests()
+    with open_recording(written) as recording:
+        for receiver_id, _, samples in _pieces(recording, None):
+            again.add(receiver_id, samples)
+    wanted, found = digests.found(), again.found()
+    for receiver_id in wanted:
+        if found.get(receiver_id) != wanted[receiver_id]:
+            raise RecordingError(
+                f"{target}: what was written of receiver `{receiver_id}` reads back as something else; check disk and "
+                "memory, and convert again"
+            )
 
 
 def _pieces(source: Recording, on_progress: Callable[[int, int], None] | None) -> Iterator[tuple[str, int, IqArray]]:
@@ -122,7 +176,14 @@ def _total_samples(source: Recording) -> int:
     return sum(int(source.blocks(name)[:, 1].sum()) for name in source.receiver_ids)
 
 
-def _to_native(source: Recording, target: Path, on_progress: Callable[[int, int], None] | None) -> None:
+def _to_native(
+    source: Recording,
+    target: Path,
+    on_progress: Callable[[int, int], None] | None,
+    *,
+    compress: str | None,
+    digests: _Digests,
+) -> None:
     with RecordingWriter(
         target,
         scenario=source.scenario,
@@ -132,9 +193,11 @@ def _to_native(source: Recording, target: Path, on_progress: Callable[[int, int]
         sample_format=source.sample_format,
         full_scale=source.full_scale,
         provenance={**source.provenance, "converted_from": f"{source.format}: {source.path.name}"},
+        compress=compress,
     ) as writer:
         for receiver_id, start, samples in _pieces(source, on_progress):
             writer.write(receiver_id, start, samples)
+            digests.add(receiver_id, samples)
         if source.truth is not None:
             writer.write_truth(source.truth)
 
@@ -213,9 +276,11 @@ class _SigmfStream(_Stream):
     def __init__(self, directory: Path, receiver_id: str, source: Recording) -> None:
         super().__init__(directory, receiver_id, source)
         self._data = (directory / f"{receiver_id}.sigmf-data").open("xb")
+        self._sha512 = hashlib.sha512()
 
     def write(self, start_index: int, samples: IqArray) -> None:
         self._data.write(samples.data)
+        self._sha512.update(samples.data)
 
     def close(self) -> None:
         self._data.close()
@@ -228,6 +293,7 @@ class _SigmfStream(_Stream):
                 "core:datatype": DATATYPES[self.source.sample_format],
                 "core:sample_rate": float(self.source.sample_rate),
                 "core:recorder": f"rfpose {__version__}",
+                "core:sha512": self._sha512.hexdigest(),
             },
         )
         offset = 0
@@ -245,12 +311,15 @@ def _to_directory(
     directory: Path,
     stream_writer: type[_Stream],
     on_progress: Callable[[int, int], None] | None,
+    *,
+    digests: _Digests,
 ) -> None:
     recorded = False
     for receiver_id, pieces in itertools.groupby(_pieces(source, on_progress), key=lambda piece: piece[0]):
         with contextlib.closing(stream_writer(directory, receiver_id, source)) as stream:
             for _, start, samples in pieces:
                 stream.write(start, samples)
+                digests.add(receiver_id, samples)
             stream.finish()
         recorded = True
     if not recorded:

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Self, get_args
+from typing import Any, Final, Self, get_args
 
 import h5py
 import numpy as np
 
 from rfpose import __version__
-from rfpose.errors import InvalidInputError
+from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 from rfpose.files import Claim
 from rfpose.recording import keys
 from rfpose.recording.base import (
@@ -30,13 +30,36 @@ from rfpose.recording.output import Hdf5Output
 from rfpose.scenario import ID_PATTERN, MAX_ID_LENGTH, MAX_SAMPLE_INDEX, Scenario
 from rfpose.truth import Truth
 
-__all__ = ["RecordingWriter"]
+__all__ = ["COMPRESSIONS", "RecordingWriter"]
+
+COMPRESSIONS: Final = ("bitshuffle-zstd", "bitshuffle-lz4", "blosc2")
+"""What `RecordingWriter` compresses by, all through hdf5plugin; nothing is lost by any."""
 
 _CHUNK_BYTES = 2**20
 _SMALLEST_CHUNK_SAMPLES = 2**14
 _CACHE_BYTES = 2**26
 """Chunks that are being filled, over all receivers together."""
 _RECEIVER_ID = re.compile(ID_PATTERN)
+
+
+def _filter(compress: str | None) -> dict[str, Any]:
+    """Return a dataset's settings for a compression."""
+    if compress is None:
+        return {}
+    if compress not in COMPRESSIONS:
+        raise InvalidInputError(f"`compress` must be one of {', '.join(COMPRESSIONS)}, got {compress!r:.40}")
+    try:
+        import hdf5plugin
+    except ImportError as error:
+        raise RecordingError(
+            f"compression needs the hdf5plugin library ({error}); install it, {install_remedy('compressed')}"
+        ) from error
+    # a sample's bits of one weight stand together: the upper ones of a weak signal are all alike
+    if compress == "blosc2":
+        return dict(hdf5plugin.Blosc2(cname="zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE))
+    if compress == "bitshuffle-lz4":
+        return dict(hdf5plugin.Bitshuffle(cname="lz4"))
+    return dict(hdf5plugin.Bitshuffle(cname="zstd", clevel=1))
 
 
 class RecordingWriter:
@@ -67,13 +90,16 @@ class RecordingWriter:
         How the samples came about, text by name.
     overwrite
         Replace an existing file.
+    compress
+        One of `COMPRESSIONS`, by which samples are made smaller without loss; None: they are not.
 
     Raises
     ------
     InvalidInputError
         An argument makes no sense.
     RecordingError
-        The file exists already; or, when the block begins, is being written by another process or cannot be written.
+        hdf5plugin is missing; the file exists already; or, when the block begins, is being written by another process
+        or cannot be written.
     """
 
     def __init__(
@@ -88,6 +114,7 @@ class RecordingWriter:
         full_scale: float,
         provenance: Mapping[str, str],
         overwrite: bool = False,
+        compress: str | None = None,
     ) -> None:
         if sample_format not in get_args(SampleFormat):
             raise InvalidInputError(f"`sample_format` must be int16 or complex64, got {sample_format!r}")
@@ -103,6 +130,7 @@ class RecordingWriter:
                     f"`receiver_ids` may hold letters, digits, `_`, `-` and `.`, {MAX_ID_LENGTH} at most, got "
                     f"{receiver_id!r:.200}"
                 )
+        self._filter = _filter(compress)
         self.path = Path(path)
         Claim([self.path], force=overwrite).look()
         self._overwrite = overwrite
@@ -235,6 +263,7 @@ class RecordingWriter:
                 chunks=(self._chunk_samples(),),
                 dtype=STORED_DTYPE[form],
                 fillvalue=fill,
+                **self._filter,
             )
 
     def _chunk_samples(self) -> int:
