@@ -2,7 +2,7 @@
 
     python benchmarks/compression.py [RECORDING]
 
-Without a recording: two frames of the shipped scenario table2_100m.toml, as simulated.
+Without a recording: eight frames of the shipped scenario table2_100m.toml, as simulated.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import rfpose as rf
-from rfpose.recording import convert, open_recording
+from rfpose.recording import Recording, convert, open_recording
 from rfpose.recording.writer import COMPRESSIONS
 
 TIMES = 3
@@ -30,14 +30,13 @@ def seconds(work: Callable[[], object]) -> float:
     return min(found)
 
 
-def read_all(path: Path) -> None:
+def read_all(recording: Recording) -> None:
     """Read as `rfpose process` does: frame by frame, where there is a scenario to tell how long one is."""
-    with open_recording(path) as recording:
-        step = 2**20 if recording.scenario is None else recording.scenario.radio.frame_samples
-        for name in recording.receiver_ids:
-            for start, count in recording.blocks(name).tolist():
-                for at in range(start, start + count, step):
-                    recording.read(name, at, min(step, start + count - at))
+    step = 2**20 if recording.scenario is None else recording.scenario.radio.frame_samples
+    for name in recording.receiver_ids:
+        for start, count in recording.blocks(name).tolist():
+            for at in range(start, start + count, step):
+                recording.read(name, at, min(step, start + count - at))
 
 
 def main() -> None:
@@ -49,18 +48,19 @@ def main() -> None:
         else:
             site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
             source = folder / "simulated.h5"
-            short = site.changed(heliostat=site.heliostat[:2], simulation={"frame_count": 2})
+            short = site.changed(heliostat=site.heliostat[:2], simulation={"frame_count": 8})
             rf.simulate(short, seed=1).save(source)
         rows: dict[str | None, tuple[int, float, float]] = {}
-        for compress in (None, *COMPRESSIONS):
-            path = folder / "out.h5"
+        path = folder / "out.h5"
+        with open_recording(source) as recording:
+            for compress in (None, *COMPRESSIONS):
 
-            def write(path: Path = path, compress: str | None = compress) -> None:
-                with open_recording(source) as recording:
+                def write(compress: str | None = compress) -> None:
                     convert(recording, path, format="rfpose-iq", overwrite=True, compress=compress, verify=False)
 
-            writing = seconds(write)
-            rows[compress] = path.stat().st_size, writing, seconds(lambda path=path: read_all(path))
+                writing = seconds(write)
+                with open_recording(path) as written:
+                    rows[compress] = path.stat().st_size, writing, seconds(lambda: read_all(written))
         size, writing, reading = rows[None]
         print(f"{source.name}: {size / 1e6:.1f} MB, written in {writing:.3f} s, read in {reading:.3f} s of processor")
         print(f"{'':16} {'size':>6} {'write':>7} {'read':>7}   of plain")

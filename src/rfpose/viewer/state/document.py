@@ -91,7 +91,7 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None, 
         Missing, damaged, or none of these; the message names the file, the place and the remedy.
     """
     path = Path(path)
-    if path.suffix == ".toml":
+    if path.suffix == ".toml" and kind_of(path) != "recording":
         scenario = load_scenario(path)
         return Document(
             path=path, kind="scenario", scenario=scenario, field=field_of_scenario(scenario), frame_start_index=_none()
