@@ -104,7 +104,7 @@ def opened_file(
 
         picture = picture_of_track(open_track(path))
         yield Opened(path=path, kind=kind, scenario=site_of_run(picture.track), track=picture)
-    elif kind == "scenario" or path.suffix == ".toml":
+    elif kind == "scenario" or (kind is None and path.suffix == ".toml"):
         yield Opened(path=path, kind="scenario", scenario=load_scenario(path))
     else:
         from rfpose.recording import open_recording

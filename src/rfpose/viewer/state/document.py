@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.errors import RfposeError
+from rfpose.kinds import kind_of
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.track_file import is_track, open_track
