@@ -24,6 +24,14 @@ class GeometryError(RfposeError, ValueError):
     """Positions that admit no solution: coincident, collinear or coplanar points."""
 
 
+class ClusterError(RfposeError, RuntimeError):
+    """Workers in other processes cannot be reached, or cannot do what is asked of them."""
+
+
+class PublishError(RfposeError, RuntimeError):
+    """Poses cannot be handed to a broker, or a server for them cannot be started."""
+
+
 def install_remedy(extra: str) -> str:
     """Return how to install what an extra needs, by the names of its packages.
 

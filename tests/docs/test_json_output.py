@@ -56,7 +56,7 @@ sample paint made
 data
 bench --seconds 0.01
 """
-APART = ("antenna learn", "demo", "warm-up")
+APART = ("antenna learn", "demo", "publish", "warm-up")
 
 
 def command_of(line: str) -> str:

@@ -32,6 +32,7 @@ COMMANDS = (
     "aim",
     "track",
     "convert",
+    "publish",
     "view",
     "plot",
     "sample",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 import rfpose
+from rfpose.cli._engine import engine_options
 from rfpose.cli._support import (
     CommonOptions,
     check_directory,
@@ -93,6 +94,7 @@ class _Sources:
 )
 @click.option("--output", "-o", type=click.Path(path_type=Path), help="Write the models: .json or .toml.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the errors: .png, .pdf, .svg.")
+@engine_options
 @force_option
 @common_options
 @gathered("sources", _Sources)

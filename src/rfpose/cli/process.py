@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import rfpose
+from rfpose.cli._engine import engine_options
 from rfpose.cli._support import (
     CommonOptions,
     check_table,
@@ -68,6 +69,7 @@ class _Tables:
         "rfpose process recording.h5 -o result.h5 --reflection estimate",
         "rfpose process recording.h5 -o result.h5 --filter",
         "rfpose process night/*.h5 cal0/ mirror*.sigmf-meta -o result.h5",
+        "rfpose process /data/night -o result.h5 --scheduler tcp://host:8786",
     ),
 )
 @click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -116,6 +118,7 @@ class _Tables:
 @click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
 @click.option("--profile", is_flag=True, help="Also tell the seconds of each stage, and what takes longest.")
 @declared_options
+@engine_options
 @follow_links_option
 @force_option
 @common_options

@@ -17,7 +17,7 @@ from scipy import signal
 
 from rfpose.checks import as_positive
 from rfpose.dsp import ESTIMATORS, LinePlan, ToneExtractor
-from rfpose.pipeline._workers import n_worker, worker_pool
+from rfpose.engine import n_core, worker_pool
 from rfpose.recording import Recording, RecordingWriter, open_recording
 
 __all__ = ["measure", "measure_memory"]
@@ -67,7 +67,7 @@ def measure(seconds: float) -> dict[str, dict[str, float]]:
 def measure_memory(seconds: float) -> float:
     """Return the rate at which all cores together read memory [GB/s]."""
     block = np.ones(64 * 2**20 // 8, np.int64)
-    parts = np.array_split(block, n_worker())
+    parts = np.array_split(block, n_core())
     with worker_pool() as pool:
         return 1e-9 * _best_rate(lambda: list(pool.map(np.max, parts)), block.nbytes, seconds)
 

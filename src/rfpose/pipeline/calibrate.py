@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from rfpose.drawing import blank_figure
-from rfpose.errors import InvalidInputError, RecordingError, RfposeError
+from rfpose.engine import gathered
+from rfpose.errors import ClusterError, InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.alarms import Alarm, alarms
 from rfpose.feedback.calibration import Calibration, FitSettings, fit, resolve_free, sun_convention
 from rfpose.feedback.measurements import Measurements, join
@@ -288,35 +289,48 @@ def calibrate(
     how = _How(parameters, settings, seed)
     if paint is not None and mounts is None and not (radio or camera or drone):
         return _calibrate_paint(Path(paint), heliostats, algorithm, how)
-    gathered = []
+    sources = []
     if paint is not None:
         records, planned = read_paint(Path(paint), heliostats, algorithm=algorithm)
-        gathered.append(records)
+        sources.append(records)
     if mounts is not None:
         planned = mounts if isinstance(mounts, MountFile) else read_models(mounts)
     known = {name: stored.mount for name, stored in planned.heliostats.items()}
     if motors is not None:
-        gathered.append(read_radio(radio, Path(motors)))
+        sources.append(read_radio(radio, Path(motors)))
     if camera is not None:
-        gathered.append(read_camera(Path(camera), known, planned.site))
+        sources.append(read_camera(Path(camera), known, planned.site))
     if drone is not None:
-        gathered.append(read_drone(Path(drone), known))
-    if not gathered:
+        sources.append(read_drone(Path(drone), known))
+    if not sources:
         raise InvalidInputError("nothing was measured: besides mounts give `paint=`, `radio=`, `camera=` or `drone=`")
-    return _calibrate_mounts(planned, gathered, heliostats, how)
+    return _calibrate_mounts(planned, sources, heliostats, how)
 
 
 def _calibrate_paint(directory: Path, heliostats: Sequence[str], algorithm: str, how: _How) -> Calibrations:
-    def one(name: str) -> HeliostatReport:
-        data = read_heliostat(directory, name, algorithm=algorithm)
+    return _each(_paint_names(directory, heliostats), _Paint(directory.absolute(), algorithm, how), how)
+
+
+@dataclass(frozen=True, slots=True)
+class _Paint:
+    """Calibrates a heliostat from its PAINT records alone."""
+
+    directory: Path
+    algorithm: str
+    how: _How
+
+    def __call__(self, name: str) -> HeliostatReport:
+        if not self.directory.is_dir():
+            raise ClusterError(
+                f"{self.directory}: is no directory here; give a path that leads to the same one everywhere"
+            )
+        data = read_heliostat(self.directory, name, algorithm=self.algorithm)
         made = Measurements.from_spots(
             data.count, sun_enu=data.sun_enu, spot_enu_m=data.spot_enu_m, unix_s=data.order_s
         )
-        _check_paint_sun(directory / name, data, made)
+        _check_paint_sun(self.directory / name, data, made)
         part = _Part("PAINT", made, tuple(map(str, data.record_ids)))
-        return _report(name, data.mount, data.site, [part], dict(data.skipped), how, data.notes)
-
-    return _each(_paint_names(directory, heliostats), one, how)
+        return _report(name, data.mount, data.site, [part], dict(data.skipped), self.how, data.notes)
 
 
 def _check_free(free: str | Sequence[str]) -> None:
@@ -336,14 +350,11 @@ def _paint_names(directory: Path, heliostats: Sequence[str]) -> Sequence[str]:
     return heliostats or found
 
 
-def _each(names: Iterable[str], one: Callable[[str], HeliostatReport], how: _How) -> Calibrations:
-    """Calibrate one after the other; who cannot be does not keep the others from it."""
-    reports, errors = [], {}
-    for name in names:
-        try:
-            reports.append(one(name))
-        except RfposeError as error:
-            errors[name] = error
+def _each(names: Sequence[str], one: Callable[[str], HeliostatReport], how: _How) -> Calibrations:
+    """Calibrate each; who cannot be does not keep the others from it."""
+    found = dict(zip(names, gathered(_tried, names, one), strict=True))
+    reports = [report for report in found.values() if isinstance(report, HeliostatReport)]
+    errors = {name: error for name, error in found.items() if isinstance(error, RfposeError)}
     if not reports:
         name, first = next(iter(errors.items()))
         others = f" ({len(errors) - 1} more could not be fitted either)" if len(errors) > 1 else ""
@@ -351,6 +362,16 @@ def _each(names: Iterable[str], one: Callable[[str], HeliostatReport], how: _How
     skipped = {name: str(error) for name, error in errors.items()}
     named = how.free if isinstance(how.free, str) else ",".join(how.free)
     return Calibrations(reports=tuple(reports), skipped=skipped, parameters=named)
+
+
+def _tried(one: Callable[[str], HeliostatReport], name: str) -> HeliostatReport | RfposeError:
+    """Calibrate a heliostat, or return what is wrong with it."""
+    try:
+        return one(name)
+    except ClusterError:
+        raise
+    except RfposeError as error:
+        return error
 
 
 def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> None:
@@ -364,31 +385,41 @@ def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> 
 
 
 def _calibrate_mounts(
-    mounts: MountFile, gathered: Sequence[Gathered], heliostats: Sequence[str], how: _How
+    mounts: MountFile, sources: Sequence[Gathered], heliostats: Sequence[str], how: _How
 ) -> Calibrations:
     """Calibrate mounts from all sources; the receivers' plane, too, where radio and another source meet."""
-    measured = {name for source in gathered for name in source.measurements}
-    skipped = {name: why for source in gathered for name, why in source.left_out.items()}
+    measured = {name for source in sources for name in source.measurements}
+    skipped = {name: why for source in sources for name, why in source.left_out.items()}
     for name in heliostats:
         if name not in mounts.heliostats:
             raise InvalidInputError(_no_mount(name, mounts))
         if name not in measured:
             raise InvalidInputError(f"heliostat {name!r} was not measured; measured were {', '.join(sorted(measured))}")
 
-    def one(name: str) -> HeliostatReport:
-        if name not in mounts.heliostats:
-            raise InvalidInputError(_no_mount(name, mounts))
+    found = _each(heliostats or sorted(measured), _Measured(mounts, sources, skipped, how), how)
+    failed = {name: why for source in sources for name, why in source.failed.items()}
+    return replace(found, skipped={**failed, **found.skipped})
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """Calibrates a heliostat from all that measured it."""
+
+    mounts: MountFile
+    sources: Sequence[Gathered]
+    skipped: Mapping[str, str]
+    how: _How
+
+    def __call__(self, name: str) -> HeliostatReport:
+        if name not in self.mounts.heliostats:
+            raise InvalidInputError(_no_mount(name, self.mounts))
         parts = []
-        for source in gathered:
+        for source in self.sources:
             if name in source.measurements:
                 made = source.measurements[name]
                 parts.append(_Part(source.source, made, tuple(f"{source.source} {i}" for i in range(len(made)))))
-        mount = mounts.heliostats[name].mount
-        return _report(name, mount, mounts.site, parts, skipped, how)
-
-    found = _each(heliostats or sorted(measured), one, how)
-    failed = {name: why for source in gathered for name, why in source.failed.items()}
-    return replace(found, skipped={**failed, **found.skipped})
+        mount = self.mounts.heliostats[name].mount
+        return _report(name, mount, self.mounts.site, parts, self.skipped, self.how)
 
 
 def _no_mount(name: str, mounts: MountFile) -> str:

@@ -1,4 +1,4 @@
-"""From IQ to tone phases for a whole recording: receivers side by side, resumable."""
+"""From IQ to tone phases for a whole recording: receivers side by side, here or on other machines; resumable."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import contextlib
 import hashlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,20 @@ import numpy.typing as npt
 
 from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
-from rfpose.pipeline._workers import worker_pool
+from rfpose.engine import Team, team_here, team_of
+from rfpose.errors import RecordingError
 from rfpose.pipeline.formats.journal import Entry, Journal
 from rfpose.pipeline.stages import Stopwatch
-from rfpose.recording import GapError, Recording
+from rfpose.recording import GapError, Recording, open_recording
 from rfpose.scenario import Scenario
 
-__all__ = ["JOURNAL_SAMPLES", "journal_key", "measure_tones"]
+__all__ = ["JOURNAL_SAMPLES", "Elsewhere", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
-"""Samples measured between two entries of the journal: about a second's work."""
+"""Samples measured here between two entries of the journal, and by each thread elsewhere: about a second's work."""
+
+_PER_THREAD = 16
+"""Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another."""
 
 _MAX_ENTRY_ROWS = 4096
 _PROBE_SAMPLES = 1024
@@ -57,6 +63,22 @@ def _fingerprint(recording: Recording) -> str:
     return found.hexdigest()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Elsewhere:
+    """Measuring in other processes, which open the recording by themselves.
+
+    Attributes
+    ----------
+    paths
+        The recording or its parts, as they see them.
+    follow_links
+        As for `rfpose.recording.open_recording`.
+    """
+
+    paths: tuple[Path, ...]
+    follow_links: bool = False
+
+
 def measure_tones(
     recording: Recording,
     scenario: Scenario,
@@ -66,6 +88,7 @@ def measure_tones(
     journal: Journal | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     stages: Stopwatch | None = None,
+    elsewhere: Elsewhere | None = None,
 ) -> TonePhases:
     """Measure every tone in every frame of every receiver.
 
@@ -86,11 +109,15 @@ def measure_tones(
         Called with (rows done, rows in all); a row is one receiver in one frame.
     stages
         Takes the time of reading and of measuring.
+    elsewhere
+        Who measures in place of this process; the phases are the same.
 
     Raises
     ------
     RecordingError
-        The recording is damaged, or the journal cannot be written.
+        The recording is damaged, or the journal cannot be written; a worker sees no, or another, recording.
+    ClusterError
+        As `rfpose.engine.team_of`.
     """
     stages = Stopwatch() if stages is None else stages
     n_receiver = len(scenario.receiver_ids)
@@ -110,28 +137,23 @@ def measure_tones(
             values[first:end] = entry[name]
         clock_ppm[:] = entry[_CLOCK_STATE]
         done = end
-    extractor = ToneExtractor(LinePlan.from_scenario(scenario), estimator, full_scale=recording.full_scale)
-    reader = _Reader(recording, scenario, frame_start_index)
-    per_entry = max(1, min(_MAX_ENTRY_ROWS, JOURNAL_SAMPLES // scenario.radio.frame_samples))
-    with worker_pool() as pool:
+    if done == n_row:
+        return tones
+    recipe = _Recipe(scenario=scenario, frame_start_index=frame_start_index, estimator=estimator)
+    bench = _Bench(recording, recipe)
+    with _team(elsewhere) as team:
+        share = _share_here(bench, n_receiver) if elsewhere is None else _share_elsewhere(bench, elsewhere, team)
+        stages.cores = team.n_at_once
         while done < n_row:
-            first, end = done, min(done + per_entry, n_row)
-
-            def measure_receiver(i_receiver: int, first: int = first, end: int = end) -> int:
-                """Measure one receiver's rows of this entry, in order, since its clock is followed."""
-                mine = range(first + (i_receiver - first) % n_receiver, end, n_receiver)
-                for row in mine:
-                    with stages.during("read"):
-                        samples = reader.read(row)
-                    with stages.during("tones", 0 if isinstance(samples, LineStatus) else len(samples)):
-                        found = _measure(extractor, samples, float(clock_ppm[i_receiver]))
-                    tones.put(row // n_receiver, i_receiver, found)
-                    clock_ppm[i_receiver] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
-                return len(mine)
-
-            for n_measured in pool.map(measure_receiver, range(n_receiver)):
-                done += n_measured
-                if on_progress is not None and n_measured:
+            first, end = done, min(done + share.rows, n_row)
+            wanted = [_Wanted(first, end, group, clock_ppm[group]) for group in share.groups]
+            for i, measured in team.map(share.measure, wanted, share.shared):
+                clock_ppm[wanted[i].i_receiver] = measured.clock_ppm
+                for row, found in measured.rows:
+                    tones.put(*divmod(row, n_receiver), found)
+                stages.add(measured.seconds, measured.samples)
+                done += len(measured.rows)
+                if on_progress is not None and measured.rows:
                     on_progress(done, n_row)
             if journal is not None:
                 entry = {name: values[first:end] for name, values in rows.items()}
@@ -145,40 +167,187 @@ def _rows(tones: TonePhases) -> Entry:
     return {name: array.reshape(-1, *array.shape[2:], copy=False) for name, array in arrays.items()}
 
 
-def _measure(extractor: ToneExtractor, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
-    if isinstance(samples, LineStatus):
-        return FrameTones.failed(extractor.plan.n_transmitter, extractor.plan.n_tone, samples)
-    return extractor.measure(samples, clock_ppm=clock_ppm)
+# -- how the work is shared ----------------------------------------------------------------------------------
 
 
-class _Reader:
-    """Reads rows for several threads; each has one buffer, which its next row overwrites."""
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """Some receivers' rows of one entry of the journal."""
 
-    def __init__(self, recording: Recording, scenario: Scenario, frame_start_index: npt.NDArray[np.int64]) -> None:
-        self._recording = recording
-        self._receiver_ids = scenario.receiver_ids
-        self._n_sample = scenario.radio.frame_samples
-        self._start_index = frame_start_index
+    first: int
+    end: int
+    i_receiver: npt.NDArray[np.int64]
+    clock_ppm: npt.NDArray[np.float64]
+    """Where each of their clocks was last seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """What came of it; stages as in `Stopwatch`."""
+
+    rows: list[tuple[int, FrameTones]]
+    clock_ppm: npt.NDArray[np.float64]
+    seconds: Mapping[str, float]
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Share:
+    """How an entry's rows become tasks."""
+
+    rows: int
+    """In an entry."""
+    groups: list[npt.NDArray[np.int64]]
+    """Receivers of each task: one's rows stay together and in order, since its clock is followed."""
+    measure: Callable[[Any, _Wanted], _Measured]
+    shared: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Recipe:
+    """What is measured in a recording, whoever opens it."""
+
+    scenario: Scenario
+    frame_start_index: npt.NDArray[np.int64]
+    estimator: str
+
+
+def _team(elsewhere: Elsewhere | None) -> contextlib.AbstractContextManager[Team]:
+    return team_here() if elsewhere is None else team_of()
+
+
+def _share_here(bench: _Bench, n_receiver: int) -> _Share:
+    groups = [np.array([i]) for i in range(n_receiver)]
+    return _Share(bench.rows_of(JOURNAL_SAMPLES), groups, _measure_here, bench)
+
+
+def _share_elsewhere(bench: _Bench, elsewhere: Elsewhere, team: Team) -> _Share:
+    n_task = min(bench.n_receiver, _PER_THREAD * team.n_at_once)
+    groups = np.array_split(np.arange(bench.n_receiver), n_task)
+    place = _Place(
+        paths=tuple(path.absolute() for path in elsewhere.paths),
+        follow_links=elsewhere.follow_links,
+        fingerprint=_fingerprint(bench.recording),
+        recipe=bench.recipe,
+    )
+    return _Share(bench.rows_of(JOURNAL_SAMPLES * team.n_at_once), groups, _measure_there, place)
+
+
+# -- where it is done ----------------------------------------------------------------------------------------
+
+
+class _Bench:
+    """Measures rows of an open recording, for several threads; each has one buffer, which its next row overwrites."""
+
+    def __init__(self, recording: Recording, recipe: _Recipe) -> None:
+        self.recording = recording
+        self.recipe = recipe
+        self._receiver_ids = recipe.scenario.receiver_ids
+        self._n_sample = recipe.scenario.radio.frame_samples
+        plan = LinePlan.from_scenario(recipe.scenario)
+        self._extractor = ToneExtractor(plan, recipe.estimator, full_scale=recording.full_scale)
         self._lock = threading.Lock()  # not every format's library can be called from several threads at once
         self._own = threading.local()
 
-    def read(self, row: int) -> Samples | LineStatus:
+    @property
+    def n_receiver(self) -> int:
+        return len(self._receiver_ids)
+
+    def rows_of(self, samples: int) -> int:
+        """Return how many rows hold about so many samples."""
+        return max(1, min(_MAX_ENTRY_ROWS, samples // self._n_sample))
+
+    def measure(self, wanted: _Wanted) -> _Measured:
+        """Measure rows, each receiver's in order, since its clock is followed."""
+        stages, clock_ppm, rows = Stopwatch(), wanted.clock_ppm.copy(), []
+        for k, i_receiver in enumerate(wanted.i_receiver):
+            begin = wanted.first + (int(i_receiver) - wanted.first) % self.n_receiver
+            for row in range(begin, wanted.end, self.n_receiver):
+                with stages.during("read"):
+                    samples = self._read(row)
+                with stages.during("tones", 0 if isinstance(samples, LineStatus) else len(samples)):
+                    found = self._found(samples, float(clock_ppm[k]))
+                rows.append((row, found))
+                clock_ppm[k] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
+        return _Measured(rows, clock_ppm, stages.seconds, stages.samples)
+
+    def _found(self, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
+        if isinstance(samples, LineStatus):
+            return FrameTones.failed(self._extractor.plan.n_transmitter, self._extractor.plan.n_tone, samples)
+        return self._extractor.measure(samples, clock_ppm=clock_ppm)
+
+    def _read(self, row: int) -> Samples | LineStatus:
         """Return one receiver's samples in one frame, or why there are none."""
-        i_frame, i_receiver = divmod(row, len(self._receiver_ids))
-        receiver_id, start = self._receiver_ids[i_receiver], int(self._start_index[i_frame])
-        if receiver_id not in self._recording.receiver_ids:
+        i_frame, i_receiver = divmod(row, self.n_receiver)
+        receiver_id, start = self._receiver_ids[i_receiver], int(self.recipe.frame_start_index[i_frame])
+        if receiver_id not in self.recording.receiver_ids:
             return LineStatus.NOT_RECORDED
         with self._lock:
-            begin = self._recording.frame_at(receiver_id, start, self._n_sample)
+            begin = self.recording.frame_at(receiver_id, start, self._n_sample)
             if begin is None:
                 return LineStatus.GAP
             try:
-                return self._recording.read(receiver_id, begin, self._n_sample, out=self._buffer())
+                return self.recording.read(receiver_id, begin, self._n_sample, out=self._buffer())
             except GapError:  # of a part that is damaged, which is said; the rest goes on
                 return LineStatus.GAP
 
     def _buffer(self) -> Samples:
         if not hasattr(self._own, "buffer"):
-            self._own.buffer = np.empty((self._n_sample, 2), self._recording.component_dtype)
+            self._own.buffer = np.empty((self._n_sample, 2), self.recording.component_dtype)
         buffer: Samples = self._own.buffer
         return buffer
+
+
+def _measure_here(bench: _Bench, wanted: _Wanted) -> _Measured:
+    return bench.measure(wanted)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Place:
+    """What a worker needs to know to open the recording by itself."""
+
+    paths: tuple[Path, ...]
+    follow_links: bool
+    fingerprint: str
+    recipe: _Recipe
+
+    @property
+    def key(self) -> str:
+        """Equal for equal work."""
+        scenario, starts = self.recipe.scenario.to_toml(), self.recipe.frame_start_index.tobytes()
+        facts: list[Any] = [
+            [str(path) for path in self.paths],
+            str(self.follow_links),
+            self.fingerprint,
+            self.recipe.estimator,
+            scenario,
+            starts.hex(),
+        ]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+_benches: dict[str, _Bench] = {}
+"""Of this worker, the newest alone: a recording stays open between its tasks."""
+_opening = threading.Lock()
+
+
+def _measure_there(place: _Place, wanted: _Wanted) -> _Measured:
+    """Measure on a worker."""
+    key = place.key
+    with _opening:
+        bench = _benches.get(key)
+        if bench is None:
+            _benches.clear()
+            bench = _benches[key] = _opened(place)
+    return bench.measure(wanted)
+
+
+def _opened(place: _Place) -> _Bench:
+    paths = place.paths
+    recording = open_recording(paths[0] if len(paths) == 1 else paths, follow_links=place.follow_links)
+    if _fingerprint(recording) != place.fingerprint:
+        raise RecordingError(
+            f"{', '.join(map(str, paths))}: is another recording here than where the job was started; give a path that leads to the "
+            "same one everywhere"
+        )
+    return _Bench(recording, place.recipe)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose import __version__
+from rfpose.engine import is_elsewhere
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.journal import Journal
@@ -33,6 +34,7 @@ from rfpose.scenario import Scenario, scenario_of
 if TYPE_CHECKING:
     from rfpose.pipeline.choice import PoseChoice
     from rfpose.pipeline.formats.result import Result
+    from rfpose.pipeline.measure import Elsewhere
 
 __all__ = ["process"]
 
@@ -88,6 +90,8 @@ def process(
 
     Raises
     ------
+    ClusterError
+        Of the `rfpose.engine.Engine` that is used, the scheduler or workers cannot be reached, or have another version.
     RecordingError
         A file that is missing, damaged, exists already, is both read and to be written, or cannot be written.
     ScenarioError
@@ -129,7 +133,10 @@ def process(
                 if isinstance(opened, PartsRecording):
                     from rfpose.pipeline.clocks import settle_clocks
 
-                    opened = settle_clocks(opened, site)
+                    settled = settle_clocks(opened, site)
+                    if settled is not opened:
+                        _refuse_found_clocks(settled)
+                    opened = settled
                     open_files.callback(opened.close)
                 starts = _frames(opened, site)
                 # compiled code, which none of the refusals above should wait for
@@ -140,6 +147,7 @@ def process(
                 from rfpose.pipeline.measure import journal_key, measure_tones
                 from rfpose.pipeline.solve import check_solvable, solve
 
+                elsewhere = _elsewhere(recording, follow_links=follow_links)
                 if estimator not in ESTIMATORS:
                     raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
                 choice = choose(site, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
@@ -150,7 +158,14 @@ def process(
                 if kept is not None:
                     journal = Journal(kept, journal_key(opened, site, estimator), restart=force)
             tones = measure_tones(
-                opened, site, starts, estimator=estimator, journal=journal, on_progress=on_progress, stages=stages
+                opened,
+                site,
+                starts,
+                estimator=estimator,
+                journal=journal,
+                on_progress=on_progress,
+                stages=stages,
+                elsewhere=elsewhere,
             )
             asked = {"reflection": reflection, "integrity": integrity, "filter": filtered, "survey": survey}
             settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
@@ -178,6 +193,29 @@ def _opened(
     if isinstance(recording, Recording):
         return contextlib.nullcontext(recording)
     return open_recording(recording, follow_links=follow_links)
+
+
+def _refuse_found_clocks(recording: Recording) -> None:
+    """Others open the parts by themselves, and do not know what was found of their clocks here."""
+    if is_elsewhere():
+        raise RecordingError(
+            f"{recording.path}: offsets of clocks are found where the recording is processed, and workers do not hear of "
+            'them; process it without workers, or write what `offset_s = "find"` found into the manifest'
+        )
+
+
+def _elsewhere(recording: Recording | RecordingSource, *, follow_links: bool) -> Elsewhere | None:
+    """Return how others get at the recording, if they are to measure it."""
+    if not is_elsewhere():
+        return None
+    from rfpose.pipeline.measure import Elsewhere
+
+    if isinstance(recording, Recording):
+        raise InvalidInputError(
+            "`recording` must be paths where others measure: workers open it themselves, by what it says of itself"
+        )
+    paths = (recording,) if isinstance(recording, str | Path) else recording
+    return Elsewhere(paths=tuple(map(Path, paths)), follow_links=follow_links)
 
 
 def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:

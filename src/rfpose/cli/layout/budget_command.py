@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 import rfpose
+from rfpose.cli._engine import engine_options
 from rfpose.cli._support import (
     check_ending,
     check_scenario,
@@ -56,6 +57,7 @@ def _say_where_not_linear(line: dict[str, Any], n_draw: int) -> None:
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="CSV: one row a source and heliostat.")
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG.")
 @field_options
+@engine_options
 @force_option
 @common_options
 def command(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import rfpose
+from rfpose.cli._engine import engine_options
 from rfpose.cli._support import (
     check_ending,
     check_scenario,
@@ -139,6 +140,7 @@ _CIRCLE: dict[str, Any] = {"type": (float, float, float), "multiple": True, "met
 @gathered("search", _Search)
 @gathered("where", _Where)
 @field_options
+@engine_options
 @force_option
 @common_options
 def command(

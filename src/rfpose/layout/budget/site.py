@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.engine import gathered
 from rfpose.errors import InvalidInputError
 from rfpose.layout.budget.sources import (
     Misalignment,
@@ -25,7 +26,7 @@ from rfpose.layout.budget.sources import (
     TransmitterSurvey,
     Wavelength,
 )
-from rfpose.layout.budget.table import ErrorBudget, budget_line, target_slope, worst_first
+from rfpose.layout.budget.table import Draws, ErrorBudget, budget_line, target_slope, worst_first
 from rfpose.layout.maps import Mirrors
 from rfpose.multilat.site import Disturbance, ForeseenMirrors
 from rfpose.scenario import Scenario
@@ -110,22 +111,19 @@ def site_budget(
     there = [np.nansum(cov) > _NONE * np.nansum(total) for cov in first_order]
     found = [(line, cov) for line, cov, present in zip(asked, first_order, there, strict=True) if present]
     streams = np.random.SeedSequence(seed).spawn(len(_LINES) + 1)
-    lines, n_failed = [], 0
-    for k, (line, cov) in enumerate(found):
-        drawn, failed = _drawn(plan, [line], n_draw, streams[_LINES.index(line)])
-        n_failed += failed
+    places = [_LINES.index(line) for line, _ in found]
+    draws = [Draws((k,), n_draw, streams[k]) for k in places] + [Draws(tuple(places), n_draw, streams[-1])]
+    *each, (together, failed) = gathered(_drawn, draws, plan, progress)
+    lines = []
+    for (line, cov), (drawn, failed_alone) in zip(found, each, strict=True):
+        failed += failed_alone
         lines.append(budget_line(line.name, line.assumed(plan), line.remedy, cov, drawn, to_target))
-        if progress is not None:
-            progress(k + 1, len(found) + 1)
-    drawn, failed = _drawn(plan, [line for line, _ in found], n_draw, streams[-1])
-    if progress is not None:
-        progress(len(found) + 1, len(found) + 1)
     carrier_m = plan.scenario.radio.propagation_speed_mps / plan.scenario.carrier_rf_hz
     return ErrorBudget(
         lines=worst_first(lines),
-        whole=budget_line("all together", "", "", total, drawn, to_target),
+        whole=budget_line("all together", "", "", total, together, to_target),
         n_draw=n_draw,
-        n_failed=n_failed + failed,
+        n_failed=failed,
         pose="site",
         wavelength_m=(float(carrier_m.mean()),),
     )
@@ -140,13 +138,12 @@ def _of_rows(plan: SitePlan, line: _Line) -> FloatArray:
     return out
 
 
-def _drawn(
-    plan: SitePlan, lines: Sequence[_Line], n_draw: int, stream: np.random.SeedSequence
-) -> tuple[FloatArray, int]:
+def _drawn(plan: SitePlan, wanted: Draws) -> tuple[FloatArray, int]:
     """(mirror, 2, 2) mean square of the normal's error through the fit, NaN without draws; failed solutions."""
     n = len(plan.mirrors.pivot_enu_m)
     total, count = np.zeros((n, 2, 2)), np.zeros(n)
-    rng = np.random.default_rng(stream)
+    rng, n_draw = np.random.default_rng(wanted.stream), wanted.n_draw
+    lines = [_LINES[k] for k in wanted.lines]
     for _ in range(n_draw):
         for part in plan.parts:
             axes = plan.mirrors.rot_enu_from_mirror[part.rows][:, :, :2]

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
+from rfpose.engine import gathered
 from rfpose.errors import InvalidInputError
 from rfpose.layout.budget.plan import WorkingPoint
-from rfpose.layout.budget.sources import SOURCES, Effect, Source
+from rfpose.layout.budget.sources import SOURCES, Effect
 from rfpose.layout.budget.world import DrawnSites
 from rfpose.layout.gain import Gain
 from rfpose.layout.maps import Mirrors
@@ -108,26 +109,23 @@ def error_budget(
         raise InvalidInputError(f"`n_draw` must not be negative, got {n_draw}")
     gain = plan.gain()
     to_target = target_slope(plan.mirrors, aim_enu_m)
-    sources = [s for s in SOURCES if s.assumed(plan)]
+    there = [k for k, source in enumerate(SOURCES) if source.assumed(plan)]
     streams = np.random.SeedSequence(seed).spawn(len(SOURCES) + 1)
-    lines, total, n_failed = [], np.zeros((len(plan.mirrors.pivot_enu_m), 2, 2)), 0
-    for k, source in enumerate(sources):
+    draws = [Draws((k,), n_draw, streams[k]) for k in there] + [Draws(tuple(there), n_draw, streams[-1])]
+    *each, (together, failed) = gathered(_draw, draws, plan, progress)
+    lines, total = [], np.zeros((len(plan.mirrors.pivot_enu_m), 2, 2))
+    for k, (drawn, failed_alone) in zip(there, each, strict=True):
+        source = SOURCES[k]
         linear = _covariance(source.effects(plan, *_outputs(gain)), gain)
         total += linear
-        drawn, failed = _draw(plan, [source], n_draw, streams[SOURCES.index(source)])
-        n_failed += failed
+        failed += failed_alone
         lines.append(budget_line(source.name, source.assumed(plan), source.remedy, linear, drawn, to_target))
-        if progress is not None:
-            progress(k + 1, len(sources) + 1)
-    drawn, failed = _draw(plan, sources, n_draw, streams[-1])
-    whole = budget_line("all together", "", "", total, drawn, to_target)
-    if progress is not None:
-        progress(len(sources) + 1, len(sources) + 1)
+    whole = budget_line("all together", "", "", total, together, to_target)
     return ErrorBudget(
         lines=worst_first(lines),
         whole=whole,
         n_draw=n_draw,
-        n_failed=n_failed + failed,
+        n_failed=failed,
         pose="rigid" if plan.estimator.rigid else "independent",
         wavelength_m=tuple(float(row.mean()) for row in plan.waves.wavelength_m),
     )
@@ -192,18 +190,26 @@ def _covariance(effects: Sequence[Effect], gain: Gain) -> FloatArray:
     return out
 
 
-def _draw(
-    plan: WorkingPoint, sources: Sequence[Source], n_draw: int, stream: np.random.SeedSequence
-) -> tuple[FloatArray, int]:
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """A line's share of the Monte Carlo."""
+
+    lines: tuple[int, ...]
+    """Which sources are at work, by their place in the list of all: what they do is code, and that does not travel."""
+    n_draw: int
+    stream: np.random.SeedSequence
+
+
+def _draw(plan: WorkingPoint, wanted: Draws) -> tuple[FloatArray, int]:
     """(mirror, 2, 2) mean square of the normal's error through the solver, NaN without draws; failed solutions."""
     n_mirror = len(plan.mirrors.pivot_enu_m)
     total, count = np.zeros((n_mirror, 2, 2)), np.zeros(n_mirror)
-    rng = np.random.default_rng(stream)
+    rng, n_draw = np.random.default_rng(wanted.stream), wanted.n_draw
     batch = max(1, _BATCH_RANGES // plan.thermal_m.size)
     for begin in range(0, n_draw, batch):
         world = DrawnSites(plan, min(batch, n_draw - begin), rng)
-        for source in sources:
-            source.disturb(world)
+        for k in wanted.lines:
+            SOURCES[k].disturb(world)
         error = world.normal_errors()
         good: npt.NDArray[np.bool_] = np.asarray(np.isfinite(error).all(axis=2))
         error = np.where(good[..., None], error, 0.0)

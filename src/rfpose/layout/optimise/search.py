@@ -12,6 +12,7 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
+from rfpose.engine import gathered
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.jit import one_thread
 from rfpose.layout.maps import Mirrors, kernel_field, plane_slope
@@ -293,17 +294,9 @@ def optimise(
     rng = np.random.default_rng(seed)
     begin = [as_float_array("also_from", x, (n_new, 3)) for x in also_from]
     begin += [draw_places(problem, n_new, rng) for _ in range(starts)]
-    found: list[tuple[float, FloatArray]] = []
-    value = np.full(len(begin), np.nan)
-    for k, start in enumerate(begin):
-        with _one_thread() if len(field.pivot_enu_m) < _FEW_POINTS else contextlib.nullcontext():
-            end = _search(problem, start)
-            if end is not None:
-                value[k] = _value(problem, end)
-                found.append((value[k], end))
-        if progress is not None:
-            progress(k + 1, len(begin))
-    found = [item for item in found if np.isfinite(item[0])]
+    ends = gathered(_searched, begin, problem, progress)
+    value = np.array([worth for worth, _ in ends])
+    found = [(worth, end) for worth, end in ends if end is not None and np.isfinite(worth)]
     if not found:
         raise GeometryError(
             "no search met the constraints with every field point determined; relax separation, zones or heights"
@@ -372,6 +365,13 @@ def draw_places(problem: Problem, n_new: int, rng: np.random.Generator) -> Float
         f"separation of {rules.separation_m:g} m, the clearance, {'the lines of sight, ' if rules.sight else ''}or the "
         "zones"
     )
+
+
+def _searched(problem: Problem, start: FloatArray) -> tuple[float, FloatArray | None]:
+    """Return what the search from one start comes to, and where it ends; NaN and None where that is nowhere."""
+    with _one_thread() if len(problem.field.pivot_enu_m) < _FEW_POINTS else contextlib.nullcontext():
+        end = _search(problem, start)
+        return (np.nan, None) if end is None else (_value(problem, end), end)
 
 
 def _search(problem: Problem, start: FloatArray) -> FloatArray | None:

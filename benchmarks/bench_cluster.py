@@ -1,0 +1,77 @@
+"""Tone measurement by two workers, by one, and by this process, one core each, in turn: ratios of one run.
+
+    python benchmarks/bench_cluster.py [--frames 20] [--rounds 5]
+
+The recording is measured once before the clock starts, so that it comes from memory and kernels are compiled. Workers
+stay between rounds. Ratios are of medians; on a machine with other work they say little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import distributed
+import numpy as np
+
+import rfpose as rf
+from rfpose.engine import Engine
+from rfpose.pipeline.measure import Elsewhere, measure_tones
+from rfpose.recording import frame_starts
+
+
+def main() -> None:
+    """Print seconds and ratios."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=5)
+    asked = parser.parse_args()
+    cores = sorted(os.sched_getaffinity(0))
+    site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml")).changed(
+        radio={"frame_samples": 400_000}, simulation={"frame_count": asked.frames}
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "rec.h5"
+        rf.simulate(site, seed=1).save(path)
+        with (
+            rf.open_recording(path) as recording,
+            distributed.LocalCluster(1, 1, dashboard_address="127.0.0.1:0", silence_logs=50) as one,
+            distributed.LocalCluster(2, 1, dashboard_address="127.0.0.1:0", silence_logs=50) as two,
+        ):
+            starts = frame_starts(recording, site.radio.frame_samples)
+
+            def alone() -> None:
+                os.sched_setaffinity(0, cores[:1])
+                try:
+                    measure_tones(recording, site, starts, estimator="hilbert")
+                finally:
+                    os.sched_setaffinity(0, cores)
+
+            def by(cluster: distributed.LocalCluster) -> None:
+                with Engine(scheduler=cluster.scheduler_address).used():
+                    measure_tones(recording, site, starts, estimator="hilbert", elsewhere=Elsewhere(path=path))
+
+            jobs = {"this process": alone, "one worker": lambda: by(one), "two workers": lambda: by(two)}
+            seconds: dict[str, list[float]] = {name: [] for name in jobs}
+            for k in range(asked.rounds + 1):
+                for name, job in jobs.items():
+                    began = time.perf_counter()
+                    job()
+                    if k:
+                        seconds[name].append(time.perf_counter() - began)
+    middle = {name: statistics.median(found) for name, found in seconds.items()}
+    n_sample = asked.frames * len(site.receiver_ids) * site.radio.frame_samples
+    print(f"{n_sample / 1e6:.0f} million samples, {len(cores)} cores, load {os.getloadavg()[0]:.1f}")
+    for name, value in middle.items():
+        spread = np.ptp(seconds[name])
+        print(f"{name:14s} {value:6.2f} s  ({spread:.2f} s between the rounds)")
+    print(f"one worker / this process, speed: {middle['this process'] / middle['one worker']:.2f}")
+    print(f"two workers / one worker, speed:  {middle['one worker'] / middle['two workers']:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""``rfpose publish``: poses for the plant, by MQTT or OPC UA."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rfpose.cli._support import (
+    CommonOptions,
+    check_there,
+    common_options,
+    emit_json,
+    examples,
+    progress,
+    say,
+    wants_json,
+)
+from rfpose.errors import InvalidInputError, PublishError
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.publish import PlantServer
+
+__all__ = ["PASSWORD_VARIABLE", "command"]
+
+PASSWORD_VARIABLE = "RFPOSE_PASSWORD"
+
+
+@click.command(
+    name="publish",
+    epilog=examples(
+        "rfpose publish result.h5 --mqtt mqtts://broker.plant --user rfpose --password-file secret",
+        "rfpose publish result.h5 --mqtt mqtt://localhost --prefix plant/field",
+        "rfpose publish result.h5 --opcua opc.tcp://0.0.0.0:4840 --certificate cert.pem --key key.pem --user scada",
+        "rfpose publish result.h5 --opcua opc.tcp://127.0.0.1:4840 --anonymous",
+    ),
+)
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option(
+    "--mqtt", metavar="URL", help="Send to this broker: mqtt://HOST[:PORT], or encrypted mqtts://HOST[:PORT]."
+)
+@click.option("--opcua", metavar="URL", help="Be an OPC UA server there until interrupted: opc.tcp://HOST:PORT.")
+@click.option("--prefix", default="rfpose", show_default=True, help="Of MQTT topics: PREFIX/pose/HELIOSTAT.")
+@click.option("--user", help="Who we are for the broker; whom the server lets in.")
+@click.option(
+    "--password-file",
+    type=click.Path(path_type=Path),
+    help=f"Holds the password in its first line. [default: the variable {PASSWORD_VARIABLE}]",
+)
+@click.option("--ca", type=click.Path(path_type=Path), help="PEM: who signed the broker's certificate.")
+@click.option("--certificate", type=click.Path(path_type=Path), help="PEM: the server's, or ours for the broker.")
+@click.option("--key", type=click.Path(path_type=Path), help="PEM: the key of --certificate.")
+@click.option("--anonymous", is_flag=True, help="OPC UA for everybody, unencrypted.")
+@click.option("--buffer", type=click.IntRange(1, 60_000), default=10_000, show_default=True,
+              help="Messages kept while the broker is away.")  # fmt: skip
+@click.option("--patience", "patience_s", type=click.FloatRange(min=0.0, min_open=True), default=60.0,
+              show_default=True, help="Wait so long for a broker that is away [s], then drop.")  # fmt: skip
+@common_options
+@click.pass_obj
+def command(
+    session: CommonOptions,
+    /,
+    result: Path,
+    mqtt: str | None,
+    opcua: str | None,
+    prefix: str,
+    user: str | None,
+    password_file: Path | None,
+    anonymous: bool,
+    buffer: int,
+    patience_s: float,
+    **keys: Path | None,
+) -> None:
+    """Hand the poses of RESULT to the plant.
+
+    By MQTT every frame's poses, QoS 1, as JSON whose schema is in PREFIX/schema; the command ends when the broker has
+    all of them. By OPC UA the last frame's, until interrupted.
+    """
+    if (mqtt is None) == (opcua is None):
+        raise click.UsageError("give one of --mqtt and --opcua")
+    check_there(result, password_file, *keys.values())
+    password = _password(password_file) if user is not None else None
+    if opcua is not None:
+        session.when_interrupted = "interrupted; the server has ended"
+        if keys.pop("ca") is not None:
+            raise click.UsageError("--ca goes with --mqtt")
+        from rfpose.pipeline.publish import PlantServer
+
+        _serve(result, PlantServer(url=opcua, user=user, password=password, anonymous=anonymous, **keys))
+        return
+    if anonymous:
+        raise click.UsageError("--anonymous goes with --opcua")
+    session.when_interrupted = "interrupted; part of the messages may have been sent"
+    from rfpose.pipeline.formats.result_file import open_result
+    from rfpose.pipeline.publish import Broker, messages, send
+
+    broker = Broker(
+        url=str(mqtt), prefix=prefix, user=user, password=password, buffer=buffer, patience_s=patience_s, **keys
+    )
+    found = open_result(result)
+    with progress("Sending") as on_progress:
+        sent = send(messages(found), broker, on_progress=on_progress, n_message=found.poses.status.size)
+    told = {
+        "broker": mqtt,
+        "acknowledged": sent.acknowledged,
+        "dropped": sent.dropped,
+        "unacknowledged": sent.unacknowledged,
+        "reconnections": sent.reconnections,
+    }
+    if sent.dropped or sent.unacknowledged:
+        raise PublishError(
+            f"{mqtt}: {sent.dropped} messages dropped, {sent.unacknowledged} never acknowledged, {sent.acknowledged} "
+            "arrived; send again when the broker is back"
+        )
+    if wants_json():
+        emit_json(told)
+        return
+    say(f"{mqtt}: {sent.acknowledged} messages arrived, the schema among them")
+
+
+def _serve(result: Path, to: PlantServer) -> None:
+    from rfpose.pipeline.formats.result_file import open_result
+    from rfpose.pipeline.publish import serve
+
+    def on_ready(address: str) -> None:
+        if wants_json():
+            emit_json({"server": address, "result": result})
+        else:
+            say(f"{address}: serving the last frame of {result}; Ctrl-C ends it")
+
+    serve(open_result(result), to, on_ready=on_ready)
+
+
+def _password(file: Path | None) -> str:
+    """Return it from a file or the environment; on a command line others would see it."""
+    if file is not None:
+        lines = file.read_text(encoding="utf-8").splitlines()
+        password = lines[0] if lines else ""
+    else:
+        password = os.environ.get(PASSWORD_VARIABLE, "")
+    if not password:
+        raise InvalidInputError(f"`user` needs a password: give `password_file=FILE`, or set {PASSWORD_VARIABLE}")
+    return password

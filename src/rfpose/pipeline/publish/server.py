@@ -1,0 +1,226 @@
+"""Poses from an OPC UA server: one object a heliostat, signed and encrypted unless it is told otherwise."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import logging
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rfpose.errors import InvalidInputError, PublishError, install_remedy
+from rfpose.pipeline.publish.messages import messages
+
+if TYPE_CHECKING:
+    from rfpose.pipeline.formats.result import Result
+
+__all__ = ["NAMESPACE", "PlantServer", "serve", "serving"]
+
+NAMESPACE = "urn:rfpose:poses"
+
+_VARIABLES = {
+    "normal_enu": ("Normal", "1", "unit vector out of the mirror's front: east, north, up"),
+    "azimuth_deg": ("Azimuth", "deg", "of the normal, from north, clockwise"),
+    "elevation_deg": ("Elevation", "deg", "of the normal above the horizon"),
+    "sigma_mrad": ("Sigma", "mrad", "RMS angle of the normal's error, both axes together"),
+    "protection_level_mrad": ("ProtectionLevel", "mrad", "off by more, without a warning, no more often than agreed"),
+}
+_TRUSTED = ("consistent", "consistent after transmitters were left out")
+_MAKE_ONE = (
+    "make one: openssl req -x509 -newkey rsa:2048 -nodes -days 365 -keyout key.pem -out cert.pem -subj /CN=rfpose "
+    f"-addext subjectAltName=URI:{NAMESPACE}:server"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantServer:
+    """How the plant gets at the poses.
+
+    Attributes
+    ----------
+    url
+        Where to listen, ``opc.tcp://HOST:PORT/PATH``.
+    certificate, key
+        PEM files by which clients know the server; Basic256Sha256.
+    user, password
+        Whom the server lets in.
+    anonymous
+        Let everybody in, unsigned and unencrypted; the others must be None.
+
+    Raises
+    ------
+    InvalidInputError
+        Another kind of address; neither certificate, key, user and password nor ``anonymous``, or both.
+    """
+
+    url: str
+    certificate: Path | None = None
+    key: Path | None = None
+    user: str | None = None
+    password: str | None = None
+    anonymous: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.url.startswith("opc.tcp://"):
+            raise InvalidInputError(f"`url` must be opc.tcp://HOST:PORT/PATH, got {self.url!r}")
+        given = [self.certificate, self.key, self.user, self.password]
+        if self.anonymous and any(given):
+            raise InvalidInputError("`anonymous=True` lets everybody in; give it without certificate, key and user")
+        if not self.anonymous and not all(given):
+            raise InvalidInputError(
+                "a server needs `certificate=`, `key=`, `user=` and the user's password, or `anonymous=True` to let "
+                f"everybody in; if there is no certificate yet, {_MAKE_ONE}"
+            )
+
+
+def serve(result: Result, to: PlantServer, *, on_ready: Callable[[str], None] | None = None) -> None:
+    """Let clients read the last frame of a result, with its status and time, until interrupted.
+
+    Parameters
+    ----------
+    result
+        Of `rfpose.process`.
+    to
+        Where, and for whom.
+    on_ready
+        Called with the address when clients may come.
+
+    Raises
+    ------
+    PublishError
+        The extra is missing, the certificate cannot be read or has run out, or the port is taken.
+    """
+
+    async def run() -> None:
+        async with serving(result, to):
+            if on_ready is not None:
+                on_ready(to.url)
+            await asyncio.Event().wait()
+
+    asyncio.run(run())
+
+
+@contextlib.asynccontextmanager
+async def serving(result: Result, to: PlantServer) -> AsyncIterator[None]:
+    """Serve as `serve` does, for a program with an event loop of its own, while the block lasts."""
+    try:
+        import asyncua  # noqa: F401
+    except ImportError as error:
+        raise PublishError(f"OPC UA needs asyncua; {install_remedy('publish')}") from error
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+    async with _listening(to) as server:
+        await _show(server, result)
+        yield
+
+
+@contextlib.asynccontextmanager
+async def _listening(to: PlantServer) -> AsyncIterator[Any]:
+    from asyncua import Server, ua
+    from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
+
+    class Gate:
+        """Knows the one user."""
+
+        def get_user(self, _server: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
+            if to.anonymous:
+                return User(role=UserRole.User)
+            told = (str(username or ""), str(password or ""))
+            known = (str(to.user), str(to.password))
+            same = [hmac.compare_digest(one.encode(), other.encode()) for one, other in zip(told, known, strict=True)]
+            return User(role=UserRole.User, name=to.user) if all(same) else None
+
+    if to.certificate is not None:
+        _check_certificate(to.certificate)
+    server = Server(user_manager=Gate())
+    await server.init()
+    server.set_endpoint(to.url)
+    server.set_server_name("rfpose")
+    await server.set_application_uri(f"{NAMESPACE}:server")
+    policy = ua.SecurityPolicyType
+    if to.anonymous:
+        server.set_security_policy([policy.NoSecurity], permission_ruleset=SimpleRoleRuleset())
+        server.set_identity_tokens([ua.AnonymousIdentityToken])
+    else:
+        server.set_security_policy(
+            [policy.Basic256Sha256_SignAndEncrypt, policy.Basic256Sha256_Sign], permission_ruleset=SimpleRoleRuleset()
+        )
+        server.set_identity_tokens([ua.UserNameIdentityToken])
+        try:
+            await server.load_certificate(to.certificate, "pem")
+            await server.load_private_key(to.key, format="pem")
+        except (OSError, ValueError, TypeError) as error:
+            raise PublishError(f"{to.key}: no private key that can be read ({error}); give a PEM file") from error
+    try:
+        await server.start()
+    except OSError as error:
+        raise PublishError(f"{to.url}: cannot listen there ({error.strerror or error}); choose another port") from error
+    try:
+        yield server
+    finally:
+        await server.stop()
+
+
+async def _show(server: Any, result: Result) -> None:
+    """Make an object for each heliostat, and fill it with the last frame."""
+    from asyncua import ua
+
+    space = await server.register_namespace(NAMESPACE)
+    field = await server.nodes.objects.add_folder(space, "Heliostats")
+    for message in messages(result, len(result.frame_start_index) - 1):
+        name = message["heliostat"]
+        mirror = await field.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
+        time = datetime.fromisoformat(message["time_utc"]).astimezone(UTC)
+        for key, (variable, unit, text) in _VARIABLES.items():
+            node = await mirror.add_variable(
+                ua.NodeId(f"{name}.{variable}", space),
+                ua.QualifiedName(variable, space),
+                [0.0] * 3 if key == "normal_enu" else 0.0,
+                ua.VariantType.Double,
+            )
+            await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(text)))
+            await node.add_property(
+                ua.NodeId(f"{name}.{variable}.EngineeringUnits", space),
+                ua.QualifiedName("EngineeringUnits", 0),
+                ua.EUInformation(DisplayName=ua.LocalizedText(unit)),
+            )
+            await node.write_value(_data_value(message, key, time))
+        for key, variable in (("status", "Status"), ("integrity", "Integrity")):
+            node = await mirror.add_variable(
+                ua.NodeId(f"{name}.{variable}", space), ua.QualifiedName(variable, space), "", ua.VariantType.String
+            )
+            value = ua.Variant(message[key] or "not tested", ua.VariantType.String)
+            await node.write_value(ua.DataValue(value, SourceTimestamp=time))
+
+
+def _data_value(message: Mapping[str, Any], key: str, time: datetime) -> Any:
+    """Return a value with its status: bad where there is none, uncertain where the tests do not vouch for it."""
+    from asyncua import ua
+
+    if message[key] is None:
+        return ua.DataValue(
+            ua.Variant(None, ua.VariantType.Null), ua.StatusCode(ua.StatusCodes.BadNoData), SourceTimestamp=time
+        )
+    vouched = message["status"] == "solved" and message["integrity"] in (*_TRUSTED, None)
+    code = ua.StatusCodes.Good if vouched else ua.StatusCodes.UncertainSensorNotAccurate
+    return ua.DataValue(ua.Variant(message[key], ua.VariantType.Double), ua.StatusCode(code), SourceTimestamp=time)
+
+
+def _check_certificate(path: Path) -> None:
+    """Refuse a certificate that clients would refuse, and say why."""
+    from cryptography import x509
+
+    try:
+        found = x509.load_pem_x509_certificate(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise PublishError(f"{path}: no certificate that can be read ({error}); {_MAKE_ONE}") from error
+    now = datetime.now(UTC)
+    if found.not_valid_after_utc < now:
+        raise PublishError(f"{path}: the certificate has run out on {found.not_valid_after_utc:%Y-%m-%d}; {_MAKE_ONE}")
+    if found.not_valid_before_utc > now:
+        raise PublishError(
+            f"{path}: the certificate holds from {found.not_valid_before_utc:%Y-%m-%d} on; wait, or see the clock"
+        )
