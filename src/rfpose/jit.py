@@ -14,9 +14,13 @@ import functools
 import importlib
 import logging
 import os
+import pickle
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 __all__ = [
@@ -196,21 +200,48 @@ def load_numba() -> Any:
 
 
 @functools.cache
-def _light_cache() -> Any:
-    """Return a cache of compiled kernels that readies for compiling only when something is compiled.
+def _cache_class() -> Any:
+    """Return numba's cache of compiled kernels with what it lacks for ours.
 
-    Numba's own loads all that its compiler knows about Python and numpy, 0.2 s, before it looks into the cache.
+    It readies for compiling only when something is compiled: numba's own loads all that its compiler knows about Python
+    and numpy, 0.2 s, before it looks. And a kernel is compiled anew when another file changes whose kernels are part of
+    it: numba's own looks at the kernel's file alone, and breaks where a type that it keeps is gone.
     """
     from numba.core.caching import FunctionCache
     from numba.core.runtime.nrt import rtsys
 
-    class LightCache(FunctionCache):
+    class KernelCache(FunctionCache):
+        def __init__(self, py_func: Function) -> None:
+            super().__init__(py_func)  # type: ignore[no-untyped-call]
+            self._cache_file._source_stamp = _stamps(py_func.__module__)
+
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
-                return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                try:
+                    return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                except (AttributeError, ImportError, pickle.UnpicklingError, EOFError):
+                    self.flush()  # type: ignore[no-untyped-call]
+                    return None
 
-    return LightCache
+    return KernelCache
+
+
+def _stamps(name: str) -> tuple[tuple[str, int, int], ...]:
+    """Return time and size of a module of kernels and of those whose kernels and types it uses."""
+    found: dict[str, tuple[str, int, int]] = {}
+    waiting = [name]
+    while waiting:
+        name = waiting.pop()
+        module = sys.modules.get(name)
+        if name in found or module is None or not getattr(module, "__file__", None):
+            continue
+        about = Path(str(module.__file__)).stat()
+        found[name] = (name, about.st_mtime_ns, about.st_size)
+        for value in vars(module).values():
+            other = str(getattr(value, "__name__" if isinstance(value, ModuleType) else "__module__", ""))
+            waiting += [other] if other.endswith("_kernels") else []
+    return tuple(sorted(found.values()))
 
 
 def _take_scipy_as_there() -> None:
@@ -232,7 +263,7 @@ def _compiled(numba: Any, function: Function, options: dict[str, Any]) -> Functi
     """Hand a function to numba, with its cache if there is a place for it."""
     dispatcher = numba.njit(**_COMMON, **options)(function)
     try:
-        dispatcher._cache = _light_cache()(function)
+        dispatcher._cache = _cache_class()(function)
     except RuntimeError as error:
         if "cache" not in str(error):
             raise

@@ -1,5 +1,8 @@
 """Kernels of rows: every row once, whoever does it."""
 
+import os
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -37,3 +40,37 @@ def test_threads_that_call_at_once_do_not_disturb_each_other():
         thread.join()
     for value in values:
         np.testing.assert_array_equal(value, 50.0)
+
+
+CALLED = """
+from typing import NamedTuple
+from rfpose.jit import kernel
+
+class {kind}(NamedTuple):
+    value: float
+
+@kernel
+def doubled(x):
+    return {factor} * x
+"""
+CALLER = """
+import inner_kernels
+from inner_kernels import doubled
+from rfpose.jit import kernel
+
+@kernel
+def of_both(x, more):
+    return doubled(x) + more.value
+"""
+CALL = "import inner_kernels, outer_kernels; print(outer_kernels.of_both(3.0, inner_kernels.{kind}(1.0)))"
+
+
+def test_a_kernel_is_compiled_anew_when_what_it_calls_changes(tmp_path):
+    """Numba looks at the kernel's own file alone: it would go on with the old one, or break where a type is gone."""
+    (tmp_path / "outer_kernels.py").write_text(CALLER)
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    for kind, factor, wanted in (("More", 2.0, "7.0"), ("More", 2.50, "8.5"), ("Renamed", 3.125, "10.375")):
+        (tmp_path / "inner_kernels.py").write_text(CALLED.format(kind=kind, factor=factor))
+        command = [sys.executable, "-c", CALL.format(kind=kind)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == wanted, done.stderr

@@ -347,7 +347,7 @@ def _opened(place: _Place) -> _Bench:
     recording = open_recording(paths[0] if len(paths) == 1 else paths, follow_links=place.follow_links)
     if _fingerprint(recording) != place.fingerprint:
         raise RecordingError(
-            f"{', '.join(map(str, paths))}: is another recording here than where the job was started; give a path that leads to the "
-            "same one everywhere"
+            f"{', '.join(map(str, paths))}: is another recording here than where the job was started; give a path that "
+            "leads to the same one everywhere"
         )
     return _Bench(recording, place.recipe)

@@ -199,7 +199,7 @@ def _refuse_found_clocks(recording: Recording) -> None:
     """Others open the parts by themselves, and do not know what was found of their clocks here."""
     if is_elsewhere():
         raise RecordingError(
-            f"{recording.path}: offsets of clocks are found where the recording is processed, and workers do not hear of "
+            f"{recording.path}: offsets of clocks are found where a recording is processed, and workers do not hear of "
             'them; process it without workers, or write what `offset_s = "find"` found into the manifest'
         )
 
