@@ -29,6 +29,7 @@ process rec.h5 -o learned.h5 --scenario learning.toml
 process rec.h5 -o told.h5 --pose site
 evaluate result.h5
 info rec.h5
+info recording.h5 night.h5
 info result.h5
 info site.toml --picture site.png
 convert rec.h5 -o converted.h5 --to rfpose-iq

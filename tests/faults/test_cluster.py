@@ -240,7 +240,7 @@ def test_wrong_choices_are_refused(recording: Path) -> None:
         Engine(workers=0)
     with (
         measure.open_recording(recording) as opened,
-        pytest.raises(InvalidInputError, match="must be a path"),
+        pytest.raises(InvalidInputError, match="must be paths"),
         Engine(workers=2).used(),
     ):
         process(opened)
