@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import subprocess
 import sys
 import warnings
 from fractions import Fraction
@@ -557,3 +558,12 @@ def test_conversion_is_checksummed_and_read_back(native, tmp_path, format, monke
     assert not (tmp_path / "out2").exists()
     with pytest.raises(InvalidInputError, match="`compress` is for rfpose-iq"):
         convert(native, tmp_path / "out3", format="sigmf", compress="blosc2")
+
+
+def test_reading_digital_rf_leaves_the_programs_logging_alone() -> None:
+    """The library sets up the root logger when it is imported."""
+    code = (
+        "import logging; from rfpose.recording.drf import import_digital_rf as go; go(); print(logging.root.handlers)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

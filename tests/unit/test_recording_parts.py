@@ -323,3 +323,14 @@ def test_the_command_line_takes_parts(whole, tmp_path):
     found = rf.open_result(tmp_path / "r.h5")
     assert found.poses.normal_enu.tobytes() == wanted.poses.normal_enu.tobytes()
     assert found.settings["command"].startswith("rfpose process p0_0.h5 p0_1.h5 p1_0.h5 --estimator")
+
+
+def test_short_bursts_are_seen_in_the_picture(tmp_path):
+    """A plant's frames last milliseconds, and hours lie between the first and the last."""
+    pieces = [("A", 0, counts(200)), ("A", 3600 * RATE, counts(200))]
+    with open_recording(write(tmp_path / "rec.h5", pieces)) as recording:
+        axes = recording.plot_coverage().axes[0]
+    (bars,) = axes.collections
+    width_s = [path.get_extents().width for path in bars.get_paths()]
+    assert len(width_s) == 2
+    assert min(width_s) > 0.003 * 3600

@@ -194,6 +194,10 @@ def say(text: str) -> None:
     click.echo(text, err=wants_json())
 
 
+_WIDE = 1000
+"""Letters; more than any table has."""
+
+
 def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a small table for a person; with ``--json`` it goes to standard error."""
     from rich.console import Console
@@ -206,7 +210,10 @@ def table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> N
         grid.add_column(Text(name), justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         grid.add_row(*(Text(cell) for cell in row))
-    Console(file=sys.stderr if wants_json() else sys.stdout).print(grid)
+    console = Console(file=sys.stderr if wants_json() else sys.stdout)
+    if not console.is_terminal:  # a file or a pipe has room for all of it
+        console.width = max(console.width, console.measure(grid, options=console.options.update(width=_WIDE)).maximum)
+    console.print(grid)
 
 
 @contextlib.contextmanager

@@ -120,14 +120,19 @@ def _print_parts(parts: Mapping[str, Mapping[str, Any]]) -> None:
             name,
             part["format"],
             _text(part["receivers"] if len(part["receivers"]) < _MANY_RECEIVERS else len(part["receivers"])),
-            _text(part["start_utc"]),
-            _text(part["end_utc"]),
+            _moment(part["start_utc"]),
+            _moment(part["end_utc"]),
             f"{part['samples']:,}",
             str(part["gaps"]),
         ]
         for name, part in parts.items()
     ]
     table("parts", ["part", "format", "receivers", "from", "until", "samples", "gaps"], rows)
+
+
+def _moment(utc: str | None) -> str:
+    """Say a time to milliseconds."""
+    return _text(utc) if utc is None else utc[:23].replace("T", " ")
 
 
 def _print(data: Mapping[str, Any], *, indent: int) -> None:

@@ -44,12 +44,17 @@ _HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, O
 
 def import_digital_rf() -> Any:
     """Return the digital_rf module, or say how to get it."""
+    root = logging.getLogger()
+    level, handlers = root.level, list(root.handlers)
     try:
         import digital_rf
     except ImportError as error:
         raise RecordingError(
             f"Digital RF needs the digital_rf library ({error}); install it, {install_remedy('digital-rf')}"
         ) from error
+    finally:  # it sets up the program's logging, and every note would be told twice
+        root.setLevel(level)
+        root.handlers[:] = handlers
     return digital_rf
 
 

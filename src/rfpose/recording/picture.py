@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_coverage", "draw_spectrum"]
 
+_LEAST_SHARE = 0.004
+"""Of the width, that a stretch is drawn: bursts of a plant's recorders are short beside the time between them."""
 _MOST_NAMES = 60
 """Receivers beyond that are drawn without their names."""
 _LEGEND = 12
@@ -77,14 +79,16 @@ def draw_coverage(recording: Recording) -> Figure:
     starts = [int(rows[0, 0]) for _, blocks in parts for rows in blocks.values() if len(rows)]
     if not starts:
         raise RecordingError(f"{recording.path}: no samples were recorded; check it with `rfpose info`")
+    ends = [int(rows[-1].sum()) for _, blocks in parts for rows in blocks.values() if len(rows)]
     first, rate = min(starts), float(recording.sample_rate)
+    least_s = _LEAST_SHARE * (max(ends) - first) / rate
     figure, axes = new_figure(WIDTH_INCH, 1.4 + 0.22 * min(len(row), _MOST_NAMES))
     for k, (name, blocks) in enumerate(parts):
         label: str | None = name if k < _LEGEND else None
         for receiver_id, rows in blocks.items():
             spans = np.stack([rows[:, 0] - first, rows[:, 1]], axis=1) / rate
             axes.broken_barh(
-                [(float(begin), float(lasts)) for begin, lasts in spans],
+                [(float(begin), max(float(lasts), least_s)) for begin, lasts in spans],
                 (row[receiver_id] - 0.35, 0.7),
                 facecolors=SERIES[k % len(SERIES)],
                 label=label,
