@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rfpose.errors import RecordingError
 
-__all__ = ["FORMAT_KINDS", "check_kind", "is_hdf5", "kind_of", "told_kind"]
+__all__ = ["FORMAT_KINDS", "check_kind", "head_of", "is_hdf5", "kind_of", "told_kind"]
 
 FORMAT_KINDS = {
     "rfpose-iq": "recording",
@@ -40,6 +40,17 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
 
+def head_of(path: Path, n_byte: int) -> bytes:
+    """Return how a file begins; nothing where it cannot be read, or is none: a pipe would be waited for."""
+    try:
+        if not path.is_file():
+            return b""
+        with path.open("rb") as file:
+            return file.read(n_byte)
+    except (OSError, ValueError):
+        return b""
+
+
 def kind_of(path: str | Path) -> str | None:
     """Return the kind: one of those of `FORMAT_KINDS`, ``scenario`` or ``truth``; None: unknown.
 
@@ -48,10 +59,8 @@ def kind_of(path: str | Path) -> str | None:
     path = Path(path)
     if path.suffix in (".sigmf", ".sigmf-meta", ".sigmf-data", ".sigmf-collection"):
         return "recording"
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except (OSError, ValueError):
+    head = head_of(path, _HEAD_BYTES)
+    if not head:
         return None
     if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:12] == b"WAVE":
         return "recording"

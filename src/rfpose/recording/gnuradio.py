@@ -15,6 +15,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.foreign import TEXT_BYTES, exact_number, exact_rate
+from rfpose.kinds import head_of
 from rfpose.recording.flat import FlatRecording, FlatStream, SampleType, sample_type
 from rfpose.recording.hdf5 import printable
 from rfpose.recording.links import refuse_outside
@@ -38,12 +39,7 @@ _SINCE_S: Final = 10**8
 
 def is_gnuradio_header(path: Path) -> bool:
     """Whether a file begins as a detached header does; false where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(12)
-    except (OSError, ValueError):
-        return False
-    return head.startswith(_MAGIC)
+    return head_of(path, 12).startswith(_MAGIC)
 
 
 class GnuRadioRecording(FlatRecording):

@@ -19,6 +19,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.foreign import exact_rate
+from rfpose.kinds import head_of
 from rfpose.recording.declared import Declared
 from rfpose.recording.flat import FlatRecording, FlatStream, SampleType, sample_type
 from rfpose.recording.sidecar import load_sidecar_scenario, receiver_name
@@ -71,11 +72,7 @@ class _Read:
 
 def is_wav(path: Path) -> bool:
     """Whether a file begins as WAV does; false where it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(12)
-    except (OSError, ValueError):
-        return False
+    head = head_of(path, 12)
     return head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:] == b"WAVE"
 
 
