@@ -53,7 +53,7 @@ def main() -> None:
 
             def by(cluster: distributed.LocalCluster) -> None:
                 with Engine(scheduler=cluster.scheduler_address).used():
-                    measure_tones(recording, site, starts, estimator="hilbert", elsewhere=Elsewhere(path=path))
+                    measure_tones(recording, site, starts, estimator="hilbert", elsewhere=Elsewhere(paths=(path,)))
 
             jobs = {"this process": alone, "one worker": lambda: by(one), "two workers": lambda: by(two)}
             seconds: dict[str, list[float]] = {name: [] for name in jobs}

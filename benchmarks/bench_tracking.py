@@ -24,11 +24,11 @@ from rfpose.scenario import load_scenario
 SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
 PLAIN = """
 import sys, time
-from rfpose.feedback.tracking import Simulation
+from rfpose.feedback.tracking import TrackingSimulation
 from rfpose.scenario import load_scenario
 base = load_scenario(sys.argv[1])
 tracking = base.tracking.model_copy(update={"first_hour": 9.0, "last_hour": 9.1})
-simulation = Simulation(base.model_copy(update={"tracking": tracking}), methods=("radio",), count=4, seed=1)
+simulation = TrackingSimulation(base.model_copy(update={"tracking": tracking}), methods=("radio",), count=4, seed=1)
 start = time.process_time()
 simulation.advance()
 print((time.process_time() - start) / (4 * len(simulation.days[0].unix_s)))

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COURSES = """
 import sys
 import numpy as np
-from rfpose.feedback.tracking import Simulation
+from rfpose.feedback.tracking import TrackingSimulation
 from rfpose.scenario import load_scenario
 base = load_scenario(sys.argv[1])
 found = {}
@@ -28,7 +28,7 @@ for collector, methods in (("heliostat", ("open-loop", "encoder", "radio-both"))
     data["tracking"]["radio"]["outages"] = ({"first_hour": 9.02, "last_hour": 9.035},)
     data["tracking"]["radio"] |= {"ground": "none", "plate_calibration": "none"}
     data["tracking"]["radio_model"] |= {"points_per_day": 8, "learn_interval_s": 20.0}
-    simulation = Simulation(type(base).model_validate(data), methods=methods, count=2, seed=4)
+    simulation = TrackingSimulation(type(base).model_validate(data), methods=methods, count=2, seed=4)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     for name, values in simulation.state().items():
@@ -45,7 +45,7 @@ for between in ("carried-on", "held"):
         {"hour": 9.008, "what": "defocus", "heliostats": ("H02",)},
         {"hour": 9.016, "what": "emergency"}, {"hour": 9.028, "what": "release"},
     ]
-    simulation = Simulation(type(base).model_validate(data), methods=("open-loop", "radio"), count=2, seed=4)
+    simulation = TrackingSimulation(type(base).model_validate(data), methods=("open-loop", "radio"), count=2, seed=4)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     modes = simulation.curves("radio").mode
