@@ -17,6 +17,8 @@ from rfpose.sun import Site
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"(?:<!-- not run: (?P<reason>.+?) -->\n+)?```python\n(?P<code>.*?)^```$", re.MULTILINE | re.DOTALL)
+TOLD = re.compile(r"^(\S.*?)  # ('.*')$", re.MULTILINE)
+"""An expression, and what a comment says that it is."""
 FOUND = [
     pytest.param(page.name, block["code"], id=f"{page.name}:{page.read_text()[: block.start()].count(chr(10)) + 1}")
     for page in PAGES
@@ -61,3 +63,12 @@ def test_block_runs(name: str, code: str, workshop: Path, tmp_path: Path, monkey
         rf.process("recording.h5", "result.h5")
     given = a_plants_own_measurements() if name == "heliostat-calibration.md" else {}
     exec(compile(code, name, "exec"), given)
+    for expression, value in TOLD.findall(code):
+        assert repr(eval(expression, given)) == value
+
+
+def test_what_comments_tell_is_found() -> None:
+    """Else nothing of a block would be compared."""
+    assert ("reply.reasons[0]", "'APPROACH refused: it tracks its aim already'") in [
+        told for each in FOUND for told in TOLD.findall(each.values[1])
+    ]

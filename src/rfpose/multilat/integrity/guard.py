@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Any
@@ -178,7 +179,7 @@ class GuardedPoses:
         return "; ".join(parts)
 
 
-class Guard:
+class Guard(ABC):
     """The loop over all mirrors; an estimator says how it tests (`judge`) and how it leaves out (`leave_out`).
 
     Hypotheses are numbered: whole transmitters first, then `PRIORS`.
@@ -214,13 +215,13 @@ class Guard:
 
     # -- what estimators differ in
 
+    @abstractmethod
     def judge(self, rows: IntArray) -> Verdict:
         """Test every hypothesis about some mirrors."""
-        raise NotImplementedError
 
+    @abstractmethod
     def leave_out(self, rows: IntArray, verdict: Verdict, single: FloatArray) -> IntArray:
         """Leave out each failing mirror's likeliest culprit; return the mirrors to be tested again."""
-        raise NotImplementedError
 
     def other_level(self) -> FloatArray:
         """(mirror,) protection level against an error found having another cause; NaN where none is likely."""
