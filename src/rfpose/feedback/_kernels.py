@@ -10,6 +10,7 @@ import numpy as np
 
 from rfpose.feedback.columns import MEASUREMENT, K, M, P
 from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.multilat.equations._kernels import factor, solve_factored
 
 N_ROW = sum(MEASUREMENT.values())
 # what is prepared of a mount: rotation by rows, pivot, opening angles at count zero, sine and cosine of the
@@ -345,34 +346,6 @@ def _prior_loss(p, free, prior_mean, prior_weight):
 
 
 @kernel
-def _cholesky_solve(a, b):
-    """Solve ``a x = b`` in place of ``b``; returns False if ``a`` is not positive definite."""
-    n = len(b)
-    for j in range(n):
-        for i in range(j, n):
-            s = a[i, j]
-            for q in range(j):
-                s -= a[i, q] * a[j, q]
-            if i == j:
-                if not s > 0.0:
-                    return False
-                a[j, j] = math.sqrt(s)
-            else:
-                a[i, j] = s / a[j, j]
-    for i in range(n):
-        s = b[i]
-        for q in range(i):
-            s -= a[i, q] * b[q]
-        b[i] = s / a[i, i]
-    for i in range(n - 1, -1, -1):
-        s = b[i]
-        for q in range(i + 1, n):
-            s -= a[q, i] * b[q]
-        b[i] = s / a[i, i]
-    return True
-
-
-@kernel
 def _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, gradient):
     """Weighted normal matrix and gradient in scaled parameters, Jacobian by forward differences."""
     n_free = len(free)
@@ -452,7 +425,8 @@ def _fit_one(
                     damped[f, g] = normal[f, g]
                 damped[f, f] *= 1.0 + damping
                 step[f] = -gradient[f]
-            if _cholesky_solve(damped, step):
+            if factor(damped, 0.0):
+                solve_factored(damped, step)
                 for f in range(n_free):
                     value = p[free[f]] + step[f] * scale[f]
                     trial[free[f]] = min(max(value, low[f]), high[f])
