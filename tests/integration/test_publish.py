@@ -293,6 +293,8 @@ def test_nobody_there_is_exit_3_and_one_line(result: Result, tmp_path: Path) -> 
     ("settings", "why"),
     [
         ({"url": "http://host"}, "mqtt://HOST"),
+        ({"url": "mqtt://host:port"}, "mqtt://HOST"),
+        ({"url": "mqtt://[::1"}, "mqtt://HOST"),
         ({"url": "mqtt://me:pw@host"}, "must hold no password"),
         ({"url": "mqtt://host", "prefix": "a/#"}, "without . and #"),
         ({"url": "mqtt://host", "user": "u", "password": "p"}, "must begin with mqtts"),
@@ -302,6 +304,12 @@ def test_nobody_there_is_exit_3_and_one_line(result: Result, tmp_path: Path) -> 
 def test_wrong_brokers_are_refused(settings: dict[str, Any], why: str) -> None:
     with pytest.raises(InvalidInputError, match=why):
         Broker(**settings)
+
+
+@pytest.mark.parametrize("url", ["http://host", "opc.tcp://host:port", "opc.tcp://host:99999", "opc.tcp://"])
+def test_wrong_addresses_of_a_server_are_refused(url: str) -> None:
+    with pytest.raises(InvalidInputError, match=r"must be opc\.tcp://HOST:PORT/PATH"):
+        PlantServer(url=url, anonymous=True)
 
 
 # -- OPC UA --------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from rfpose.cli._support import (
     common_options,
     emit_json,
     examples,
+    gathered,
     progress,
     say,
     wants_json,
@@ -26,6 +28,24 @@ if TYPE_CHECKING:
 __all__ = ["PASSWORD_VARIABLE", "command"]
 
 PASSWORD_VARIABLE = "RFPOSE_PASSWORD"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Keys:
+    """By what the two ends know each other."""
+
+    ca: Path | None
+    certificate: Path | None
+    key: Path | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ToBroker:
+    """What goes with MQTT alone."""
+
+    prefix: str
+    buffer: int
+    patience_s: float
 
 
 @click.command(
@@ -58,20 +78,19 @@ PASSWORD_VARIABLE = "RFPOSE_PASSWORD"
 @click.option("--patience", "patience_s", type=click.FloatRange(min=0.0, min_open=True), default=60.0,
               show_default=True, help="Wait so long for a broker that is away [s], then drop.")  # fmt: skip
 @common_options
+@gathered("keys", _Keys)
+@gathered("to_broker", _ToBroker)
 @click.pass_obj
 def command(
     session: CommonOptions,
-    /,
     result: Path,
     mqtt: str | None,
     opcua: str | None,
-    prefix: str,
     user: str | None,
     password_file: Path | None,
     anonymous: bool,
-    buffer: int,
-    patience_s: float,
-    **keys: Path | None,
+    keys: _Keys,
+    to_broker: _ToBroker,
 ) -> None:
     """Hand the poses of RESULT to the plant.
 
@@ -80,15 +99,23 @@ def command(
     """
     if (mqtt is None) == (opcua is None):
         raise click.UsageError("give one of --mqtt and --opcua")
-    check_there(result, password_file, *keys.values())
+    check_there(result, password_file, keys.ca, keys.certificate, keys.key)
     password = _password(password_file) if user is not None else None
     if opcua is not None:
         session.when_interrupted = "interrupted; the server has ended"
-        if keys.pop("ca") is not None:
+        if keys.ca is not None:
             raise click.UsageError("--ca goes with --mqtt")
         from rfpose.pipeline.publish import PlantServer
 
-        _serve(result, PlantServer(url=opcua, user=user, password=password, anonymous=anonymous, **keys))
+        to = PlantServer(
+            url=opcua,
+            certificate=keys.certificate,
+            key=keys.key,
+            user=user,
+            password=password,
+            anonymous=anonymous,
+        )
+        _serve(result, to)
         return
     if anonymous:
         raise click.UsageError("--anonymous goes with --opcua")
@@ -96,9 +123,7 @@ def command(
     from rfpose.pipeline.formats.result_file import open_result
     from rfpose.pipeline.publish import Broker, messages, send
 
-    broker = Broker(
-        url=str(mqtt), prefix=prefix, user=user, password=password, buffer=buffer, patience_s=patience_s, **keys
-    )
+    broker = Broker(url=str(mqtt), user=user, password=password, **asdict(keys), **asdict(to_broker))
     found = open_result(result)
     with progress("Sending") as on_progress:
         sent = send(messages(found), broker, on_progress=on_progress, n_message=found.poses.status.size)

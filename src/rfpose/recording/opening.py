@@ -128,10 +128,9 @@ def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | Non
         return RawRecording(path, scenario=scenario, declared=declared)
     if declared is not None or is_wav(path):
         return WavRecording(path, scenario=scenario, declared=declared, follow_links=follow_links)
-    header = path if path.suffix == ".hdr" else path.with_name(f"{path.name}.hdr")
-    if is_gnuradio_header(header) or is_gnuradio_header(path):
-        one = header if is_gnuradio_header(header) else path
-        return GnuRadioRecording(one, scenario=scenario, follow_links=follow_links)
+    for header in (path.with_name(f"{path.name}.hdr"), path):
+        if is_gnuradio_header(header):
+            return GnuRadioRecording(header, scenario=scenario, follow_links=follow_links)
     if path.is_dir():
         return _open_directory(path, scenario, follow_links=follow_links)
     if path.suffix in _SIGMF_SUFFIXES:

@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult
 
 from rfpose.errors import InvalidInputError, PublishError, install_remedy
+from rfpose.pipeline.publish.address import address_of
 from rfpose.pipeline.publish.messages import SCHEMA
 
 __all__ = ["Broker", "Sent", "send"]
@@ -72,8 +73,6 @@ class Broker:
     patience_s: float = 60.0
 
     def __post_init__(self) -> None:
-        if self._parts.scheme not in _PORTS or not self._parts.hostname:
-            raise InvalidInputError(f"`url` must be mqtt://HOST[:PORT] or mqtts://HOST[:PORT], got {self.url!r}")
         if self._parts.username is not None or self._parts.password is not None:
             raise InvalidInputError(
                 "`url` must hold no password, which others could read; give `user=` and a file of it"
@@ -90,8 +89,8 @@ class Broker:
             )
 
     @property
-    def _parts(self) -> Any:
-        return urlsplit(self.url)
+    def _parts(self) -> SplitResult:
+        return address_of(self.url, _PORTS, "mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
 
     @property
     def host(self) -> str:

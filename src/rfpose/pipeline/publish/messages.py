@@ -16,16 +16,21 @@ from rfpose.pipeline.formats.result import frame_time
 if TYPE_CHECKING:
     from rfpose.pipeline.formats.result import Result
 
-__all__ = ["SCHEMA", "SCHEMA_NAME", "messages"]
+__all__ = ["QUANTITIES", "SCHEMA", "SCHEMA_NAME", "VOUCHED", "messages"]
 
 SCHEMA_NAME = "rfpose-pose/1"
-_NUMBER = ("number", "null")
-_UNIT_BY_KEY: dict[str, tuple[str, str]] = {
+QUANTITIES: dict[str, tuple[str, str]] = {
+    "normal_enu": ("1", "unit vector out of the mirror's front: east, north, up"),
     "azimuth_deg": ("deg", "of the normal, from north, clockwise"),
     "elevation_deg": ("deg", "of the normal above the horizon"),
     "sigma_mrad": ("mrad", "RMS angle of the normal's error, both axes together"),
     "protection_level_mrad": ("mrad", "the normal is off by more, without a warning, no more often than agreed"),
 }
+"""What is told of a pose: unit and meaning by key."""
+VOUCHED = (IntegrityStatus.OK.reason, IntegrityStatus.EXCLUDED.reason)
+"""What tests of the residuals say of a normal that they stand by."""
+_VECTOR = {"type": ["array", "null"], "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+_NUMBER = {"type": ["number", "null"]}
 SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
     "$id": SCHEMA_NAME,
@@ -38,17 +43,9 @@ SCHEMA: dict[str, Any] = {
         "time_utc": {"type": "string", "format": "date-time", "description": "first sample of the frame"},
         "status": {"type": "string", "description": "of the pose, in words; `solved` is the good one"},
         "integrity": {"type": ["string", "null"], "description": "what tests of the residuals found, in words"},
-        "normal_enu": {
-            "type": ["array", "null"],
-            "items": {"type": "number"},
-            "minItems": 3,
-            "maxItems": 3,
-            "unit": "1",
-            "description": "unit vector out of the mirror's front: east, north, up",
-        },
         **{
-            key: {"type": list(_NUMBER), "unit": unit, "description": text}
-            for key, (unit, text) in _UNIT_BY_KEY.items()
+            key: {**(_VECTOR if key == "normal_enu" else _NUMBER), "unit": unit, "description": text}
+            for key, (unit, text) in QUANTITIES.items()
         },
         "why_null": {
             "type": "object",
@@ -63,8 +60,7 @@ SCHEMA: dict[str, Any] = {
         "time_utc",
         "status",
         "integrity",
-        "normal_enu",
-        *_UNIT_BY_KEY,
+        *QUANTITIES,
         "why_null",
     ],
     "additionalProperties": False,

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfpose.errors import InvalidInputError, PublishError, install_remedy
-from rfpose.pipeline.publish.messages import messages
+from rfpose.pipeline.publish.address import address_of
+from rfpose.pipeline.publish.messages import QUANTITIES, VOUCHED, messages
 
 if TYPE_CHECKING:
     from rfpose.pipeline.formats.result import Result
@@ -23,13 +24,12 @@ __all__ = ["NAMESPACE", "PlantServer", "serve", "serving"]
 NAMESPACE = "urn:rfpose:poses"
 
 _VARIABLES = {
-    "normal_enu": ("Normal", "1", "unit vector out of the mirror's front: east, north, up"),
-    "azimuth_deg": ("Azimuth", "deg", "of the normal, from north, clockwise"),
-    "elevation_deg": ("Elevation", "deg", "of the normal above the horizon"),
-    "sigma_mrad": ("Sigma", "mrad", "RMS angle of the normal's error, both axes together"),
-    "protection_level_mrad": ("ProtectionLevel", "mrad", "off by more, without a warning, no more often than agreed"),
+    "normal_enu": "Normal",
+    "azimuth_deg": "Azimuth",
+    "elevation_deg": "Elevation",
+    "sigma_mrad": "Sigma",
+    "protection_level_mrad": "ProtectionLevel",
 }
-_TRUSTED = ("consistent", "consistent after transmitters were left out")
 _MAKE_ONE = (
     "make one: openssl req -x509 -newkey rsa:2048 -nodes -days 365 -keyout key.pem -out cert.pem -subj /CN=rfpose "
     f"-addext subjectAltName=URI:{NAMESPACE}:server"
@@ -65,8 +65,7 @@ class PlantServer:
     anonymous: bool = False
 
     def __post_init__(self) -> None:
-        if not self.url.startswith("opc.tcp://"):
-            raise InvalidInputError(f"`url` must be opc.tcp://HOST:PORT/PATH, got {self.url!r}")
+        address_of(self.url, ("opc.tcp",), "opc.tcp://HOST:PORT/PATH")
         given = [self.certificate, self.key, self.user, self.password]
         if self.anonymous and any(given):
             raise InvalidInputError("`anonymous=True` lets everybody in; give it without certificate, key and user")
@@ -174,7 +173,8 @@ async def _show(server: Any, result: Result) -> None:
         name = message["heliostat"]
         mirror = await field.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
         time = datetime.fromisoformat(message["time_utc"]).astimezone(UTC)
-        for key, (variable, unit, text) in _VARIABLES.items():
+        for key, variable in _VARIABLES.items():
+            unit, text = QUANTITIES[key]
             node = await mirror.add_variable(
                 ua.NodeId(f"{name}.{variable}", space),
                 ua.QualifiedName(variable, space),
@@ -204,7 +204,7 @@ def _data_value(message: Mapping[str, Any], key: str, time: datetime) -> Any:
         return ua.DataValue(
             ua.Variant(None, ua.VariantType.Null), ua.StatusCode(ua.StatusCodes.BadNoData), SourceTimestamp=time
         )
-    vouched = message["status"] == "solved" and message["integrity"] in (*_TRUSTED, None)
+    vouched = message["status"] == "solved" and message["integrity"] in (*VOUCHED, None)
     code = ua.StatusCodes.Good if vouched else ua.StatusCodes.UncertainSensorNotAccurate
     return ua.DataValue(ua.Variant(message[key], ua.VariantType.Double), ua.StatusCode(code), SourceTimestamp=time)
 
