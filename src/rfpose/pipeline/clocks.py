@@ -8,6 +8,7 @@ At a wrong time it does not. Where the tones do not wander measurably, only wher
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -185,6 +186,7 @@ class _Comparison:
         self._extractor = ToneExtractor(LinePlan.from_scenario(scenario), full_scale=recording.full_scale)
         self._heard: dict[tuple[str, int], tuple[FloatArray, FloatArray] | None] = {}
         self._known = set(scenario.receiver_ids)
+        self._wanders = functools.cache(self._changes_enough)
 
     def ahead_s(self, blocks: Mapping[str, IndexArray], reference: str) -> int | None:
         """Return by how many seconds a part's clock is ahead; 0: it is right; None: the tones cannot tell."""
@@ -205,7 +207,7 @@ class _Comparison:
             return best if len(found) > 1 and len(good) == 1 else None
         return best if now.rad > _CLEARER * good[best].rad else None
 
-    def _wanders(self, reference: str) -> bool:
+    def _changes_enough(self, reference: str) -> bool:
         """Whether the tones change enough for a wrong time to be seen."""
         own = (self._spread(reference, reference, lag) for lag in LAGS_S if lag > 0)
         return any(spread is not None and not spread.fits for spread in own)
@@ -237,15 +239,15 @@ class _Comparison:
         """Return starts of frames that the reference recorded, and the other a lag later."""
         n = self._n_sample
         starts: list[int] = []
-        theirs = self._recording.blocks(name)
-        for begin, count in self._recording.blocks(reference).tolist():
-            i = np.searchsorted(theirs.sum(axis=1), begin + shift, side="right")
-            while i < len(theirs) and theirs[i, 0] < begin + count + shift:
-                low = max(begin, int(theirs[i, 0]) - shift)
-                high = min(begin + count, int(theirs[i].sum()) - shift)
+        mine, theirs = self._recording.blocks(reference), self._recording.blocks(name) - np.array([shift, 0])
+        mine_ends, their_ends = mine.sum(axis=1), theirs.sum(axis=1)
+        first = np.searchsorted(their_ends, mine[:, 0], side="right")
+        behind = np.searchsorted(theirs[:, 0], mine_ends, side="left")
+        for k in np.flatnonzero(first < behind):
+            for i in range(first[k], behind[k]):
+                low, high = int(max(mine[k, 0], theirs[i, 0])), int(min(mine_ends[k], their_ends[i]))
                 if high - low >= n:
                     starts += [low] if high - low < 2 * n else [low, (low + high - n) // 2, high - n]
-                i += 1
         n_chosen = min(_FRAMES, len(starts))
         return [starts[round(k)] for k in np.linspace(0, len(starts) - 1, n_chosen).tolist()]
 
