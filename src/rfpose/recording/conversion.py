@@ -78,10 +78,8 @@ def convert(
     InvalidInputError
         Unknown ``format`` or ``compress``, or a format that knows no compression.
     RecordingError
-        What was written reads back as something else.
-    RecordingError
         The target exists, is or holds what is read, or cannot be written; the format's library is missing; the source
-        is damaged.
+        is damaged; what was written reads back as something else.
     """
     if format not in get_args(WrittenFormat):
         raise InvalidInputError(f"`format` must be one of {', '.join(get_args(WrittenFormat))}, got {format!r}")
