@@ -87,3 +87,62 @@ def test_functions_have_few_parameters(path):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             count = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs])
             assert count <= 12, f"line {node.lineno}: {count} parameters"
+
+
+MEANINGLESS = set(
+    [
+        "Found",
+        "Told",
+        "Problem",
+        "State",
+        "Scene",
+        "Mirrors",
+        "Stages",
+        "World",
+        "Workshop",
+        "Plan",
+        "Data",
+        "Info",
+        "Item",
+        "Manager",
+        "Thing",
+        "Things",
+    ]
+)
+
+
+def test_a_class_name_means_one_thing():
+    where = {}
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                where.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert {name: places for name, places in where.items() if len(places) > 1} == {}
+    assert not MEANINGLESS & set(where), "say what is found, told or planned"
+
+
+def _imports(path):
+    """Yield (module, name) of what a script, or a page's code, imports of rfpose."""
+    blocks = [path.read_text()]
+    if path.suffix == ".md":
+        blocks = re.findall(r"^```python\n(.*?)^```", blocks[0], re.M | re.S)
+    for block in blocks:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "rfpose":
+                yield from ((node.module, alias.name) for alias in node.names)
+
+
+OUTSIDE = [
+    ROOT / "README.md",
+    *(p for d in ("benchmarks", "scripts", "docs") for p in sorted((ROOT / d).rglob("*.[mp][dy]"))),
+]
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_is_imported_beside_the_package_is_there(path):
+    """Types are checked in the package only: a name that changed there may live on in a page or a benchmark."""
+    for module, name in _imports(path):
+        file = ROOT.joinpath("src", *module.split("."))
+        text = (file / "__init__.py" if file.is_dir() else file.with_suffix(".py")).read_text()
+        is_module = (file / name).is_dir() or (file / f"{name}.py").exists()
+        assert is_module or re.search(rf"\b{name}\b", text), f"{module} has no {name}"
