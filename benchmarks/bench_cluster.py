@@ -20,7 +20,7 @@ import numpy as np
 
 import rfpose as rf
 from rfpose.engine import Engine
-from rfpose.pipeline.measure import Elsewhere, measure_tones
+from rfpose.pipeline.measure import OtherProcesses, measure_tones
 from rfpose.recording import frame_starts
 
 
@@ -53,7 +53,7 @@ def main() -> None:
 
             def by(cluster: distributed.LocalCluster) -> None:
                 with Engine(scheduler=cluster.scheduler_address).used():
-                    measure_tones(recording, site, starts, estimator="hilbert", elsewhere=Elsewhere(paths=(path,)))
+                    measure_tones(recording, site, starts, estimator="hilbert", elsewhere=OtherProcesses(paths=(path,)))
 
             jobs = {"this process": alone, "one worker": lambda: by(one), "two workers": lambda: by(two)}
             seconds: dict[str, list[float]] = {name: [] for name in jobs}

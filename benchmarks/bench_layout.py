@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from rfpose.layout import maps
-from rfpose.layout.maps import ESTIMATORS, Mirrors
+from rfpose.layout.maps import ESTIMATORS, PosedMirrors
 from rfpose.layout.optimise import CRITERIA, Constraints, Zone, evaluate_placement, optimise
 from rfpose.measurement import Noise
 from rfpose.pipeline.bench_multilat import TRANSMITTER_ENU_M
@@ -24,7 +24,7 @@ SIGMA_M, CARRIER_M = 1e-3, 1e-5
 N_LOOP = 200
 
 
-def field(n: int, scale: float = 100.0) -> Mirrors:
+def field(n: int, scale: float = 100.0) -> PosedMirrors:
     """Mirrors all over a disc, facing the tower under one sun."""
     point = maps.disc_points(n, radius_m=scale)
     return maps.mirrors_facing(
@@ -42,7 +42,7 @@ def best(function: Callable[[], Any], rounds: int = 15) -> float:
     return min(times)
 
 
-def loop(mirrors: Mirrors, name: str, n: int) -> np.ndarray:
+def loop(mirrors: PosedMirrors, name: str, n: int) -> np.ndarray:
     """One mirror after the other in numpy: rows of the Jacobian, normal matrix, inverse."""
     out = np.empty(n)
     t = TRANSMITTER_ENU_M
@@ -110,7 +110,7 @@ def speed() -> None:
     print(f"{'':14}{'10 000 [ms]':>12}{'2000 [ms]':>12}{'numpy [us each]':>17}{'ratio':>8}{'difference':>12}")
     for name in ("pdop", *ESTIMATORS):
 
-        def of(mirrors: Mirrors, name: str = name) -> np.ndarray:
+        def of(mirrors: PosedMirrors, name: str = name) -> np.ndarray:
             if name == "pdop":
                 return maps.dilution(TRANSMITTER_ENU_M, mirrors.pivot_enu_m).position
             return maps.normal_map(TRANSMITTER_ENU_M, mirrors, noise, ESTIMATORS[name])

@@ -13,7 +13,7 @@ import numpy as np
 from rfpose.geometry import enu_from_azimuth_elevation
 from rfpose.layout.fields import radial_staggered
 from rfpose.layout.maps import mirrors_facing
-from rfpose.propagation import BoxesStanding, Foresight, PlatesStanding, Soil, Stand, Surroundings, foresee
+from rfpose.propagation import BoxesStanding, Foresight, PlatesStanding, ReceiverStand, Soil, Surroundings, foresee
 
 PLACES = np.array([[1.6, 0.0, 0.05], [-1.6, 1.35, 0.05], [-1.6, -1.35, 0.05]])
 STEPS = {
@@ -47,7 +47,7 @@ def main() -> None:
         permittivity=np.array([5.24]), conductivity_s_per_m=np.array([0.02]),
     )  # fmt: skip
     things = Surroundings(plates=plates, boxes=tower, soil=Soil(permittivity=15.0, conductivity_s_per_m=0.01))
-    stand = Stand(
+    stand = ReceiverStand(
         pivot_enu_m=pivot, rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
         receiver_mirror_m=np.broadcast_to(PLACES, (n, *PLACES.shape)), own_plate=np.arange(n),
     )  # fmt: skip

@@ -18,14 +18,14 @@ from rich.console import Console
 from rich.table import Table
 
 from rfpose.feedback.fieldcontrol.bus import BusSettings, capacity
-from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
-from rfpose.feedback.fieldcontrol.emergency import EmergencyField, Play, TowerReceiver, play, ring_field
+from rfpose.feedback.fieldcontrol.control import ControlledField, FieldSettings
+from rfpose.feedback.fieldcontrol.emergency import EmergencyField, EmergencyRun, TowerReceiver, play, ring_field
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S
 from rfpose.feedback.fieldcontrol.packets import RESOLUTION_RAD
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
-SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
+SITE = Location(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 NOON_S = unix_seconds(["2024-03-21T10:50:00Z"])[0]
 STEP_S = 0.5
 START_S = -9.5
@@ -47,9 +47,9 @@ def run(
     noon_s: float = NOON_S,
     until_s: float = 300.0,
     settings: FieldSettings | None = None,
-) -> Play:
+) -> EmergencyRun:
     """Play one emergency at 0 s, after 9.5 s of tracking; every heliostat was heard just before."""
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=field.receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,
         mode=Mode.TRACK,
@@ -60,7 +60,7 @@ def run(
     )
     times = np.arange(START_S, until_s + STEP_S, STEP_S)
 
-    def alarm(control: FieldControl) -> None:
+    def alarm(control: ControlledField) -> None:
         if dead:
             control.fail_cluster(0)  # the innermost ring: shortest way, most flux
         control.emergency()
@@ -74,7 +74,7 @@ def run(
     )
 
 
-def row(result: Play) -> list[str]:
+def row(result: EmergencyRun) -> list[str]:
     """Return the times of one emergency as text."""
     return [
         f"{result.time_below_s(0.1):.1f}",
@@ -113,7 +113,7 @@ def emergencies(console: Console, n: int, seed: int) -> None:
 def power_loss(console: Console, n: int, seed: int) -> None:
     """Print what mirrors do that stand still while the sun goes on."""
     field = make_field(n)
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=field.receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,
         mode=Mode.TRACK,
@@ -162,7 +162,7 @@ def faults(console: Console, n: int, seed: int) -> None:
     field = make_field(n)
     for lost, ber, late in cases:
         bus = BusSettings(lost=lost, bit_error_rate=ber, late=late)
-        control = FieldControl(
+        control = ControlledField(
             aim_enu_m=field.receiver.centre_enu_m,
             pivot_enu_m=field.pivot_enu_m,
             mode=Mode.TRACK,
@@ -173,7 +173,7 @@ def faults(console: Console, n: int, seed: int) -> None:
     console.print(table)
 
 
-def _hour(control: FieldControl, bus: BusSettings) -> list[str]:
+def _hour(control: ControlledField, bus: BusSettings) -> list[str]:
     """Return the parts of heliostat-intervals with each kind of trouble."""
     n = control.n_heliostat
     axis = np.zeros((n, 2))
@@ -195,7 +195,7 @@ def speed(console: Console, seed: int) -> None:
     """Print what a servo step of the field's control costs."""
     for n in (1000, 10_000):
         field = make_field(n)
-        control = FieldControl(
+        control = ControlledField(
             aim_enu_m=field.receiver.centre_enu_m,
             pivot_enu_m=field.pivot_enu_m,
             mode=Mode.TRACK,

@@ -25,8 +25,8 @@ from rfpose.propagation import (
     PlatesStanding,
     RayKind,
     Rays,
+    ReceiverStand,
     Soil,
-    Stand,
     Surroundings,
     bystanders,
     foresee,
@@ -46,7 +46,7 @@ class Traced:
     place: str
     carrier_hz: float
     transmitter_enu_m: np.ndarray
-    mirrors: Stand
+    mirrors: ReceiverStand
     surroundings: Surroundings
     link: np.ndarray
     """(ray,) number of the link, as `Rays` counts."""
@@ -126,13 +126,13 @@ def soil(site: dict[str, Any], carrier_hz: float) -> Soil:
     return Soil(permittivity=permittivity, conductivity_s_per_m=conductivity)
 
 
-def standing_mirrors(site: dict[str, Any], place: str, sun: int, names: list[str]) -> Stand:
+def standing_mirrors(site: dict[str, Any], place: str, sun: int, names: list[str]) -> ReceiverStand:
     """Stand the instrumented mirrors, or the calibration receivers, where the table has them."""
     if place == "cal":
         return bystanders(site["CAL"])
     pivot = np.array(list(site["PIVOT"].values()))
     normal = np.array([site["normal"](p, site["SUNS"][sun]) for p in pivot])
-    return Stand(
+    return ReceiverStand(
         pivot_enu_m=pivot,
         rot_enu_from_mirror=rot_enu_from_mirror(normal),
         receiver_mirror_m=np.broadcast_to(site["PLACES"][place], (len(pivot), *site["PLACES"][place].shape)),
@@ -151,7 +151,7 @@ def kind_of(code: str, own: str) -> int:
     return RayKind.DIFFRACTED if "D:" in code else RayKind.SPECULAR
 
 
-def lengths_m(rays: Rays, mirrors: Stand, n_transmitter: int) -> tuple[np.ndarray, np.ndarray]:
+def lengths_m(rays: Rays, mirrors: ReceiverStand, n_transmitter: int) -> tuple[np.ndarray, np.ndarray]:
     """Return each ray's link, and its length in these poses."""
     link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
     mirror = link // (mirrors.receiver_mirror_m.shape[1] * n_transmitter)

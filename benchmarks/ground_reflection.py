@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from rfpose import geometry
 from rfpose.multilat.ground import GroundSolution, Reflector, Surface, fresnel_coefficient, solve_with_ground
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
 from rfpose.pipeline.bench_multilat import TRANSMITTER_ENU_M
 
 SPEED_MPS = 299_792_458.0
@@ -40,7 +40,7 @@ class Measured:
 
     carrier_rf_hz: Array
     observations: list[Observation]
-    knowledge: Knowledge
+    knowledge: MirrorKnowledge
     start_rot: Array
     pivot_true: Array
     rot_true: Array
@@ -149,7 +149,7 @@ def measure(
     return Measured(
         carrier_rf_hz=k * SPEED_MPS / (2 * np.pi),
         observations=observations,
-        knowledge=Knowledge(
+        knowledge=MirrorKnowledge(
             clock_sigma_m=0.0,
             pivot_enu_m=pivot + 5e-3 * rng.standard_normal((n_mirror, 3)),
             pivot_sigma_m=5e-3,

@@ -19,7 +19,7 @@ from rich.table import Table
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
 from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
     [
@@ -74,10 +74,10 @@ def field(n: int, rng: np.random.Generator, *, shared: bool, calibrated: bool = 
     z = z + noise * SIGMA * rng.standard_normal(z.shape)
     z += noise * (SIGMA if calibrated else 10.0) * rng.standard_normal((n, 1, 10))
     z += 10.0 * rng.standard_normal((n, 1 if shared else 3, 1))
-    known = Knowledge(clock_sigma_m=0.0 if shared else np.inf)
+    known = MirrorKnowledge(clock_sigma_m=0.0 if shared else np.inf)
     if not calibrated:
         survey = pivot + 5e-3 * rng.standard_normal(pivot.shape)
-        known = Knowledge(clock_sigma_m=known.clock_sigma_m, pivot_enu_m=survey, pivot_sigma_m=5e-3)
+        known = MirrorKnowledge(clock_sigma_m=known.clock_sigma_m, pivot_enu_m=survey, pivot_sigma_m=5e-3)
     settings = {
         "sigma_m": SIGMA,
         "transmitter_sigma_m": SIGMA if calibrated else np.inf,

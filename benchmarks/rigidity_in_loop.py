@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 from rfpose.feedback.servo import PiLaw, run_loop
 from rfpose.feedback.servo.margins import design_law
-from rfpose.feedback.structure import EDWARDS_MODE, Structure, plate_mode_hz
+from rfpose.feedback.structure import EDWARDS_MODE, StructureMode, plate_mode_hz
 from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.feedback.tracking.budget import SampledLoop, track_budget
 from rfpose.feedback.wind import perfect_servo, rigidity_gain, sunshine_deflection
@@ -76,7 +76,7 @@ def rms_mrad(scenario: Scenario, method: str, mirrors: int) -> float:
 
 def by_frequency(loop: SampledLoop, mode_hz: float, wind_mps: float, size_m: float) -> tuple[float, float]:
     """Return the gain of rigidity in this wind, and in all sunny hours; no mode: of the background alone."""
-    mode = Structure(natural_hz=mode_hz or 2.2, damping=damping(mode_hz or 2.2, wind_mps))
+    mode = StructureMode(natural_hz=mode_hz or 2.2, damping=damping(mode_hz or 2.2, wind_mps))
     parts = [wind_deflection(1e-3, wind_mps, mode, size_m=size_m, residual=each) for each in (None, loop.left)]
     here = [float(back) + (float(swing) if mode_hz else 0.0) for back, swing in parts]
     if mode_hz:
@@ -87,7 +87,7 @@ def by_frequency(loop: SampledLoop, mode_hz: float, wind_mps: float, size_m: flo
 
 def designed(interval_s: float, mode_hz: float, wind_mps: float) -> PiLaw:
     """Return the law of the highest gain that keeps the margins, with the structure in the loop and without."""
-    mode = Structure(natural_hz=mode_hz, damping=damping(mode_hz, wind_mps)) if mode_hz else None
+    mode = StructureMode(natural_hz=mode_hz, damping=damping(mode_hz, wind_mps)) if mode_hz else None
     laws = [design_law(each, interval_s=interval_s) for each in (None, mode)]
     return min(laws, key=lambda law: law.gain_per_s)
 
@@ -132,7 +132,7 @@ def in_loop(hours: Sequence[float], mirrors: int, wind_mps: float) -> None:
 
 def background(edge_hz: float, *, size_m: float = DISH_M, wind_mps: float | None = None) -> float:
     """Return rms of the background at a perfect servo's edge of 0.001 Hz over that at this edge."""
-    mode = Structure(natural_hz=2.0, damping=0.013)
+    mode = StructureMode(natural_hz=2.0, damping=0.013)
 
     def rms(edge: float) -> float:
         servo = perfect_servo(edge)
@@ -146,11 +146,11 @@ def background(edge_hz: float, *, size_m: float = DISH_M, wind_mps: float | None
 def stiffness_with_its_mode(density_kg_m2: float, edge_hz: float) -> tuple[float, float]:
     """Return x̄₁ [mrad] that bends 1 mrad rms in sunny hours, and the mode of (5.25) that goes with it [Hz]."""
 
-    def mode(bend_rad: float) -> Structure:
+    def mode(bend_rad: float) -> StructureMode:
         natural = plate_mode_hz(
             0.6, density_kg_m3=density_kg_m2, thickness_m=1.0, deflection_1mps_rad=bend_rad, diameter_m=5.0
         )
-        return Structure(natural_hz=natural, damping=min(0.026 * 18.0 / density_kg_m2 / natural, 0.9))
+        return StructureMode(natural_hz=natural, damping=min(0.026 * 18.0 / density_kg_m2 / natural, 0.9))
 
     def beyond(bend_rad: float) -> float:
         return (

@@ -145,7 +145,7 @@ def in_the_field(options):
     import real_field
 
     from rfpose.pipeline.site.mounts import planned_mounts
-    from rfpose.pipeline.survey import Besides, Frames, survey_frames
+    from rfpose.pipeline.survey import Frames, SurveyKnowledge, survey_frames
 
     folders = real_field.Folders(given=options.traced, own=options.tables, patterns=options.patterns)
     suns = [sun for sun in range(40) if folders.table("open", 433.0, sun) is not None]
@@ -166,7 +166,9 @@ def in_the_field(options):
             continue
         frames = Frames(carrier=tones.carrier[:n], sigma=tones.carrier_sigma[:n], unix_s=np.full(n, np.nan))
         begin = time.perf_counter()
-        found = survey_frames([frames], site, Besides(mounts=planned_mounts(site, None), correlation=correlation))
+        found = survey_frames(
+            [frames], site, SurveyKnowledge(mounts=planned_mounts(site, None), correlation=correlation)
+        )
         took = time.perf_counter() - begin
         judged = Judged()
         for i, true in enumerate(mounts):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rfpose.feedback.tracking import Score, TrackingSimulation, score
-from rfpose.feedback.tracking.budget import Budget, track_budget
+from rfpose.feedback.tracking.budget import MethodBudget, track_budget
 from rfpose.scenario import Scenario, load_scenario
 
 SCENARIO = Path(__file__).resolve().parents[1] / "data" / "tracking_100m.toml"
@@ -86,7 +86,7 @@ def simulated(scenario: Scenario, methods: Sequence[str], mirrors: int, seed: in
     return {m.name: score(simulation.sums(m.name)) for m in simulation.methods}
 
 
-def row(name: str, budget: Budget, found: Score) -> str:
+def row(name: str, budget: MethodBudget, found: Score) -> str:
     """Return one line of a table."""
     total, rms = 1e3 * budget.total_rad, 1e3 * found.normal_rms_rad
     return (

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
 from rfpose.multilat.rigid.integers import IntegerMethod, RigidSolution, solve_ladder
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ def run(case: Case, n: int, seed: int) -> Count:
     """Simulate and solve ``n`` mirrors."""
     count = Count()
     places = np.tile(PLACES_M, (CHUNK, 1, 1))
-    known = Knowledge(clock_sigma_m=0.0)
+    known = MirrorKnowledge(clock_sigma_m=0.0)
     turn = rot_enu_from_mirror([0, 0, 1]).T @ rot_enu_from_mirror([0.07, 0.07, 1.0])
     for chunk in range(-(-n // CHUNK)):
         rng = np.random.default_rng([seed, chunk])

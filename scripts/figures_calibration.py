@@ -19,12 +19,12 @@ from rfpose.feedback.drone import CAMERA, fly, gouws_bounds, uniform_priors
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, command, posture
 from rfpose.feedback.optics import reflect
-from rfpose.sun import Site, sun_position
+from rfpose.sun import Location, sun_position
 
 TARGET = np.array([11.0, 27.0, 4.25])
 START = Mount(pivot_enu_m=np.zeros(3), parameters={"arm_normal_m": 0.4325, "arm_up_m": 0.24})
 TRUE = START.replace(axis_2_zero_rad=np.deg2rad(3.0), axis_1_zero_rad=np.deg2rad(-3.0))
-SITE = Site(latitude_rad=np.deg2rad(-33.927), longitude_rad=np.deg2rad(18.864), altitude_m=119.0)
+SITE = Location(latitude_rad=np.deg2rad(-33.927), longitude_rad=np.deg2rad(18.864), altitude_m=119.0)
 LEAST_SQUARES = FitSettings(sigma_known=True, huber=np.inf)
 FOUR = PARAMETER_SETS["edwards-4"]
 NUMBERS = (3, 10, 30, 100, 300, 1000, 3000, 10000)

@@ -13,21 +13,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rfpose.feedback.fieldcontrol.bus import BusSettings
-from rfpose.feedback.fieldcontrol.control import FieldControl
+from rfpose.feedback.fieldcontrol.control import ControlledField
 from rfpose.feedback.fieldcontrol.diagram import draw_modes
-from rfpose.feedback.fieldcontrol.emergency import EmergencyField, Play, TowerReceiver, play, ring_field
+from rfpose.feedback.fieldcontrol.emergency import EmergencyField, EmergencyRun, TowerReceiver, play, ring_field
 from rfpose.feedback.fieldcontrol.modes import Mode, dot
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
-SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
+SITE = Location(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 COLOURS = {Mode.TRACK: "#E69F00", Mode.EMERGENCY: "#D55E00", Mode.STOWING: "#56B4E9", Mode.STOW: "#0072B2"}
 
 
-def emergency(n: int, seed: int) -> Play:
+def emergency(n: int, seed: int) -> EmergencyRun:
     """Play an alarm at 0 s with one message in twenty lost and the innermost cluster dead."""
     receiver = TowerReceiver(centre_enu_m=np.array([0.0, 0.0, 60.0]), width_m=12.0, height_m=12.0)
     field = EmergencyField(pivot_enu_m=ring_field(n), receiver=receiver)
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,
         mode=Mode.TRACK,
@@ -38,7 +38,7 @@ def emergency(n: int, seed: int) -> Play:
     times = np.arange(-9.5, 180.0, 0.25)
     noon_s = unix_seconds(["2024-03-21T10:50:00Z"])[0]
 
-    def alarm(control: FieldControl) -> None:
+    def alarm(control: ControlledField) -> None:
         control.fail_cluster(0)
         control.emergency()
 
@@ -46,7 +46,7 @@ def emergency(n: int, seed: int) -> Play:
     return play(control, field, time_s=times, sun_enu=sun, happenings={0.0: alarm})
 
 
-def draw_emergency(result: Play) -> Figure:
+def draw_emergency(result: EmergencyRun) -> Figure:
     """Draw flux and modes over time."""
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     FigureCanvasAgg(figure)

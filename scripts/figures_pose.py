@@ -18,7 +18,7 @@ from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat.ground import Reflector, range_shift_m, solve_with_ground
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, solve_with_integrity
 from rfpose.multilat.rigid import (
-    Knowledge,
+    MirrorKnowledge,
     MirrorProblem,
     Observation,
     full_covariance,
@@ -69,7 +69,7 @@ def save(figure: plt.Figure, directory: Path, name: str) -> None:
     plt.close(figure)
 
 
-def bound(pivot: np.ndarray, rot: np.ndarray, sigma_m: list[float], known: Knowledge) -> np.ndarray:
+def bound(pivot: np.ndarray, rot: np.ndarray, sigma_m: list[float], known: MirrorKnowledge) -> np.ndarray:
     """Bound of the normal; more than one sigma: the second is the carrier's."""
     n = len(pivot)
     sigma = np.broadcast_to(np.array(sigma_m)[None, :, None, None], (n, len(sigma_m), 3, 10))
@@ -95,9 +95,9 @@ def clocks(directory: Path) -> None:
     # the carrier at 100 MHz, twice the tone's power over m²: phase noise is m/√2 of the tone's
     carrier_m = RANGE_SIGMA_M * (0.75e6 / 100e6) * 0.8 / np.sqrt(2.0)
     forms = {
-        "three clocks": ([RANGE_SIGMA_M], Knowledge()),
-        "one clock": ([RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0)),
-        "carrier": ([RANGE_SIGMA_M, carrier_m], Knowledge(clock_sigma_m=0.0)),
+        "three clocks": ([RANGE_SIGMA_M], MirrorKnowledge()),
+        "one clock": ([RANGE_SIGMA_M], MirrorKnowledge(clock_sigma_m=0.0)),
+        "carrier": ([RANGE_SIGMA_M, carrier_m], MirrorKnowledge(clock_sigma_m=0.0)),
     }
     label = {
         "three clocks": "rigid, three clocks a frame",
@@ -126,7 +126,7 @@ def delays(directory: Path) -> None:
         "clock_class": [0],
     }
     whole = full_covariance(MirrorProblem.expected(TRANSMITTER, PLACES, pivot, rot, **common))
-    one = rms(bound(pivot, rot, [RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0)))
+    one = rms(bound(pivot, rot, [RANGE_SIGMA_M], MirrorKnowledge(clock_sigma_m=0.0)))
     three = rms(tilt_sigma_rad(whole[:, :6, :6], rot[:, :, 2]))
     figure, axes = plt.subplots(figsize=(6.4, 3.8))
     for rate_ps, colour in ((0.1, "tab:green"), (1.0, "tab:blue"), (10.0, "tab:orange"), (100.0, "tab:red")):
@@ -181,7 +181,7 @@ def delays(directory: Path) -> None:
 def edge() -> None:
     """Print what learned delays leave where one clock is worth most: at the edge, facing the tower."""
     pivot, rot, n_frame = np.array([[100.0, 0.0, 0.0]]), rot_enu_from_mirror(np.array([[-1.0, 0.0, 1.0]])), 50
-    one = bound(pivot, rot, [RANGE_SIGMA_M], Knowledge(clock_sigma_m=0.0))[0]
+    one = bound(pivot, rot, [RANGE_SIGMA_M], MirrorKnowledge(clock_sigma_m=0.0))[0]
     whole = full_covariance(
         MirrorProblem.expected(
             TRANSMITTER,
@@ -215,7 +215,7 @@ def reflection(directory: Path) -> None:
     pivot, rot = mirrors(n, 5, inner=10.0)
     receiver = pivot[:, None] + np.einsum("mab,rb->mra", rot, PLACES)
     distance = np.linalg.norm(receiver[:, :, None] - TRANSMITTER, axis=-1)
-    known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=pivot, pivot_sigma_m=0.005)
+    known = MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=pivot, pivot_sigma_m=0.005)
     sizes = np.array([0.0, 0.01, 0.03, 0.1, 0.2, 0.3, 0.5])
     error = {"ignored": [], "estimated": []}
     flagged = []
@@ -289,7 +289,7 @@ def integrity(directory: Path) -> None:
         "clock_class": [0],
         "start_pivot_enu_m": pivot,
         "start_rot_enu_from_mirror": rot,
-        "knowledge": Knowledge(clock_sigma_m=0.0),
+        "knowledge": MirrorKnowledge(clock_sigma_m=0.0),
     }
     sizes = np.array([1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 300.0, 1000.0])
     plain, guarded, found, level = [], [], [], []

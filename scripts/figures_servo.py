@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from rfpose.feedback.energy import combine_errors_rad, dish_efficiency, heliostat_intercept
 from rfpose.feedback.servo import PiLaw, Stepper, design_law, limit_cycle_rad, margins, run_loop, sensitivity
 from rfpose.feedback.servo.margins import sampled_plant, sampled_response
-from rfpose.feedback.structure import EDWARDS_MODE, Structure
+from rfpose.feedback.structure import EDWARDS_MODE, StructureMode
 from rfpose.feedback.wind import gust_process, perfect_servo, rigidity_gain, sunshine_deflection, wind_bend
 
-STIFF = Structure(natural_hz=2.0, damping=0.013)
+STIFF = StructureMode(natural_hz=2.0, damping=0.013)
 SIZE_M = 4.43
 LATENCY_S = (0.0, 1.0, 2.0, 3.0, 4.0)
 
@@ -124,11 +124,11 @@ def rigidity() -> None:
     """Print V55's numbers."""
     click.echo("natural_hz damping background resonant [x1] softer_by(0.1 Hz) softer_by(real servo)")
     for natural, damping in ((0.5, 0.05), (1.0, 0.026), (2.0, 0.013)):
-        mode = Structure(natural_hz=natural, damping=damping)
+        mode = StructureMode(natural_hz=natural, damping=damping)
         found = sunshine_deflection(1.0, mode, size_m=SIZE_M)
         law = design_law(mode, latency_s=0.3)
 
-        def left(frequency: np.ndarray, law: PiLaw = law, mode: Structure = mode) -> np.ndarray:
+        def left(frequency: np.ndarray, law: PiLaw = law, mode: StructureMode = mode) -> np.ndarray:
             inside = sensitivity(law, mode, np.minimum(frequency, 0.49), latency_s=0.3)
             return np.where(frequency < 0.49, inside, 1.0)
 

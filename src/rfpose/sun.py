@@ -13,7 +13,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Site", "Sun", "site_from_degrees", "sun_position", "unix_seconds", "why_never"]
+__all__ = ["Location", "Sun", "site_from_degrees", "sun_position", "unix_seconds", "why_never"]
 
 # ΔT = TT − UT1 has been 69 s to within 0.4 s since 2017; a second is 0.2 µrad of the sun's own motion.
 _DELTA_T_S = 69.2
@@ -24,7 +24,7 @@ _GREATEST_DECLINATION_DEG = 23.44 + 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Site:
+class Location:
     """Where on Earth the site frame's origin lies, and its air.
 
     Attributes
@@ -96,7 +96,7 @@ class Sun:
     direction_enu: FloatArray
 
 
-def site_from_degrees(latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> Site:
+def site_from_degrees(latitude_deg: float, longitude_deg: float, altitude_m: float = 0.0) -> Location:
     """Return the site at a latitude and longitude in degrees, as files and commands give them.
 
     Parameters
@@ -122,7 +122,7 @@ def site_from_degrees(latitude_deg: float, longitude_deg: float, altitude_m: flo
             raise InvalidInputError(f"the {name} must lie between {low:g} and {high:g} {unit}, got {value!r:.40}")
         values.append(float(value))
     latitude, longitude = np.radians(values[:2])
-    return Site(latitude_rad=float(latitude), longitude_rad=float(longitude), altitude_m=values[2])
+    return Location(latitude_rad=float(latitude), longitude_rad=float(longitude), altitude_m=values[2])
 
 
 def unix_seconds(times: Sequence[datetime | str] | npt.NDArray[np.datetime64]) -> FloatArray:
@@ -153,7 +153,7 @@ def unix_seconds(times: Sequence[datetime | str] | npt.NDArray[np.datetime64]) -
     return np.array(seconds, np.float64)
 
 
-def sun_position(unix_s: npt.ArrayLike, site: Site) -> Sun:
+def sun_position(unix_s: npt.ArrayLike, site: Location) -> Sun:
     """Return the apparent sun over a site.
 
     Parameters

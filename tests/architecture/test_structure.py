@@ -1,6 +1,7 @@
 """What holds for the tree as a whole."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -10,6 +11,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
+
+
+@functools.cache
+def parsed(path):
+    return ast.parse(path.read_text())
 
 
 def test_import_is_light():
@@ -45,7 +51,7 @@ def test_reordered_sums_are_not_called_from_kernels(path):
     Which of them runs depends on whether the caller came from the cache, so that equal runs would give unequal bytes.
     Inline such a piece (`kernel_inline`) or call it from Python only.
     """
-    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
+    functions = [node for node in parsed(path).body if isinstance(node, ast.FunctionDef)]
     decorators = {f.name: {d.id for d in f.decorator_list if isinstance(d, ast.Name)} for f in functions}
     fast = {name for name, names in decorators.items() if names & {"kernel_fast", "kernel_parallel_fast"}}
     for function in functions:
@@ -61,7 +67,7 @@ def test_private_names_stay_in_their_module(path):
     """
     source = ROOT / "src"
     here = path.relative_to(source).parts
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if not (isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rfpose")):
             continue
         parts = tuple(node.module.split("."))
@@ -83,7 +89,60 @@ def test_functions_have_few_parameters(path):
     """
     if path.name == "_kernels.py":
         return
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             count = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs])
             assert count <= 12, f"line {node.lineno}: {count} parameters"
+
+
+MEANINGLESS = {
+    "Data",
+    "Found",
+    "Item",
+    "Mirrors",
+    "Plan",
+    "Problem",
+    "Scene",
+    "Stages",
+    "State",
+    "Told",
+    "Workshop",
+    "World",
+}
+
+
+def test_a_class_name_means_one_thing():
+    where = {}
+    for path in SOURCES:
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                where.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert {name: places for name, places in where.items() if len(places) > 1} == {}
+    assert not MEANINGLESS & set(where), "say what is found, told or planned"
+
+
+def _imports(path):
+    """Yield (module, name) of what a script, or a page's code, imports of rfpose."""
+    blocks = [path.read_text()]
+    if path.suffix == ".md":
+        blocks = re.findall(r"^```python\n(.*?)^```", blocks[0], re.M | re.S)
+    for block in blocks:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "rfpose":
+                yield from ((node.module, alias.name) for alias in node.names)
+
+
+OUTSIDE = [
+    ROOT / "README.md",
+    *(p for d in ("benchmarks", "scripts", "docs") for p in sorted((ROOT / d).rglob("*.[mp][dy]"))),
+]
+
+
+@pytest.mark.parametrize("path", OUTSIDE, ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_is_imported_beside_the_package_is_there(path):
+    """Types are checked in the package only: a name that changed there may live on in a page or a benchmark."""
+    for module, name in _imports(path):
+        file = ROOT.joinpath("src", *module.split("."))
+        text = (file / "__init__.py" if file.is_dir() else file.with_suffix(".py")).read_text()
+        is_module = (file / name).is_dir() or (file / f"{name}.py").exists()
+        assert is_module or re.search(rf"\b{name}\b", text), f"{module} has no {name}"

@@ -17,7 +17,7 @@ from rfpose import geometry
 from rfpose.cli._app import app
 from rfpose.feedback.calibration import fit
 from rfpose.feedback.camera.render import Beam, CameraView, Target, render
-from rfpose.feedback.drone import Drone, fly
+from rfpose.feedback.drone import RtkDrone, fly
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect, target_offset_m
@@ -26,10 +26,10 @@ from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.formats.mount_file import read_models
 from rfpose.pipeline.formats.result_file import open_result
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
-SITE = Site(latitude_rad=np.deg2rad(37.1), longitude_rad=np.deg2rad(-2.36), altitude_m=500.0)
+SITE = Location(latitude_rad=np.deg2rad(37.1), longitude_rad=np.deg2rad(-2.36), altitude_m=500.0)
 BOARD_ENU_M, BOARD_NORMAL = np.array([0.0, 0.0, 12.0]), np.array([0.0, 1.0, 0.0])
 PLANNED = Mount(pivot_enu_m=np.array([6.0, 36.0, 1.5]), actuators=(Actuator(counts_per_unit=5000.0),) * 2)
 TRUE = PLANNED.replace(
@@ -92,7 +92,7 @@ def _take_pictures(folder: Path) -> None:
 
 def _fly(path: Path) -> None:
     (made,) = fly(
-        [TRUE], target_enu_m=[0.0, 0.0, 12.0], n_point=60, rng=np.random.default_rng(2), drone=Drone(), layout="dome"
+        [TRUE], target_enu_m=[0.0, 0.0, 12.0], n_point=60, rng=np.random.default_rng(2), drone=RtkDrone(), layout="dome"
     )
     names = ",".join(f"{what}_{axis}_m" for what in ("drone", "target") for axis in ("east", "north", "up"))
     rows = [["A1", *c, *r[:3], *r[4:7]] for c, r in zip(made.count.tolist(), made.row.tolist(), strict=True)]

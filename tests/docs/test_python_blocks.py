@@ -12,7 +12,7 @@ import pytest
 
 import rfpose as rf
 from rfpose.feedback.mount import Mount, command, posture
-from rfpose.sun import Site
+from rfpose.sun import Location
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -45,7 +45,7 @@ def a_plants_own_measurements() -> dict[str, Any]:
         "spots": np.tile(aim, (10, 1)),
         "sun": suns[0],
         "aim": aim,
-        "site": Site(latitude_rad=0.65, longitude_rad=-0.04),
+        "site": Location(latitude_rad=0.65, longitude_rad=-0.04),
         "times": 1782043200.0 + 3600.0 * np.arange(4),
     }
 

@@ -144,7 +144,7 @@ def test_a_worker_that_cannot_see_the_recording_is_named(
     starts = np.array([seen.blocks(seen.receiver_ids[0])[0, 0]])
     by = Engine(scheduler=cluster.scheduler_address)
     for path, why in ((tmp_path / "absent.h5", "no such file"), (tmp_path / "other.h5", "is another recording here")):
-        there = measure.Elsewhere(paths=(path,))
+        there = measure.OtherProcesses(paths=(path,))
         with by.used(), pytest.raises(RecordingError, match=rf"worker tcp://[\d.:]+: {path}: {why}"):
             measure.measure_tones(seen, site, starts, estimator="hilbert", elsewhere=there)
     seen.close()

@@ -33,7 +33,7 @@ from rfpose.pipeline.samples.paint import write_json, write_paint
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
 from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
-from rfpose.sun import Site
+from rfpose.sun import Location
 from rfpose.tables import write_csv
 
 # what is wrong may well give NaN, of which numpy warns
@@ -382,7 +382,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read_pictures(folder: Path) -> object:
-    site = Site(latitude_rad=0.66, longitude_rad=-0.04, altitude_m=500.0)
+    site = Location(latitude_rad=0.66, longitude_rad=-0.04, altitude_m=500.0)
     return read_camera(folder, {"A": Mount(pivot_enu_m=np.array([0.0, 80.0, 3.0]))}, site)
 
 

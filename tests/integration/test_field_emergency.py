@@ -5,14 +5,14 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings
-from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
+from rfpose.feedback.fieldcontrol.control import ControlledField, FieldSettings
 from rfpose.feedback.fieldcontrol.emergency import EmergencyField, TowerReceiver, play, ring_field, share_on_receiver
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.geometry import bisector_enu, rot_enu_from_mirror, unit
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
 NOON_S = unix_seconds(["2024-03-21T10:50:00Z"])[0]
-SITE = Site(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
+SITE = Location(latitude_rad=np.radians(-33.93), longitude_rad=np.radians(18.865))
 
 
 def _field(n, **changes):
@@ -21,7 +21,7 @@ def _field(n, **changes):
 
 
 def _play(field, times, *, happenings, mode=Mode.TRACK, bus=None, settings=None, wind_mps=0.0, seed=1):
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=field.receiver.centre_enu_m,
         pivot_enu_m=field.pivot_enu_m,
         mode=mode,
@@ -59,7 +59,9 @@ def test_flux_and_stow_with_lost_messages_and_a_dead_cluster(n, step_s, n_dead):
 def test_prototypes_times():
     # Malan, §6.5: all images off the receiver in under 10 s, all heliostats stowed in under two minutes.
     settings = FieldSettings(emergency_hold_s=0.0, stow_stagger_s=0.0)
-    got = _play(_field(320), np.arange(-5.0, 130.0, 0.5), settings=settings, happenings={0.0: FieldControl.emergency})
+    got = _play(
+        _field(320), np.arange(-5.0, 130.0, 0.5), settings=settings, happenings={0.0: ControlledField.emergency}
+    )
     assert np.max(got.off_receiver_s) < 10.0
     assert np.max(got.stowed_s) < 120.0
 
@@ -82,7 +84,7 @@ def test_flux_comes_back_on_approach_and_goes_with_the_wind():
         times,
         mode=Mode.STOW,
         wind_mps=wind,
-        happenings={2.0: lambda control: control.command(Event.APPROACH)},
+        happenings={2.0: lambda control: control.command(ModeEvent.APPROACH)},
     )
     assert got.flux[:5].max() < 1e-6
     assert got.flux[240] == pytest.approx(1.0, abs=0.03)
@@ -96,7 +98,7 @@ def test_flux_comes_back_on_approach_and_goes_with_the_wind():
 
 def test_mirrors_without_power_stay_and_the_sun_takes_the_flux_away():
     times = np.arange(0.0, 2400.0, 20.0)
-    got = _play(_field(64), times, happenings={20.0: FieldControl.power_off})
+    got = _play(_field(64), times, happenings={20.0: ControlledField.power_off})
     assert got.flux[3] > 0.95
     assert got.flux[-1] < 0.1
     assert got.n_mode[-1, Mode.POWER_LOSS] == 64
@@ -152,7 +154,7 @@ def test_rings_keep_their_distance(n):
 
 def test_wrong_input_says_what_is_wrong():
     field = _field(4)
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=[0.0, 0.0, 60.0], pivot_enu_m=np.zeros((3, 3)), mode=Mode.TRACK, rng=np.random.default_rng(0)
     )
     with pytest.raises(InvalidInputError, match="must have the 3 heliostats of `control`, got 4"):

@@ -23,7 +23,7 @@ from rfpose.multilat.ground import (
     solve_with_ground,
 )
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
 
 SPEED = 299_792_458.0
@@ -39,7 +39,7 @@ class Field:
 
     carrier_rf_hz: np.ndarray
     observations: list[Observation]
-    knowledge: Knowledge
+    knowledge: MirrorKnowledge
     start_rot: np.ndarray
     pivot_true: np.ndarray
     rot_true: np.ndarray
@@ -146,7 +146,7 @@ def make_field(
     return Field(
         carrier_rf_hz=k * SPEED / (2 * np.pi),
         observations=observations,
-        knowledge=Knowledge(
+        knowledge=MirrorKnowledge(
             clock_sigma_m=0.0 if shared else np.inf,
             pivot_enu_m=pivot + 5e-3 * rng.standard_normal((n_mirror, 3)),
             pivot_sigma_m=5e-3,

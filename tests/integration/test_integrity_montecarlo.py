@@ -11,7 +11,7 @@ import pytest
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus, solve_with_integrity
 from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -36,10 +36,10 @@ class Field:
         z += 5.0 * rng.standard_normal((n, 1 if shared else 3, 1))
         self.z = z[:, None]
         clock = 0.0 if shared else np.inf
-        self.known = Knowledge(clock_sigma_m=clock)
+        self.known = MirrorKnowledge(clock_sigma_m=clock)
         if not calibrated:
             survey = pivot + 5e-3 * rng.standard_normal(pivot.shape)
-            self.known = Knowledge(clock_sigma_m=clock, pivot_enu_m=survey, pivot_sigma_m=5e-3)
+            self.known = MirrorKnowledge(clock_sigma_m=clock, pivot_enu_m=survey, pivot_sigma_m=5e-3)
         self.common = SIGMA if calibrated else np.inf
         self.settings = {
             "sigma_m": SIGMA,

@@ -18,7 +18,7 @@ from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.learn import learn_from_frames
 from rfpose.pipeline.postures import commanded_normals
 from rfpose.pipeline.site.frames import measured_frames
-from rfpose.pipeline.survey import Besides, survey_frames
+from rfpose.pipeline.survey import SurveyKnowledge, survey_frames
 from told import undocumented, unseen
 
 RF_HZ = 433e6
@@ -252,7 +252,7 @@ def test_a_surveys_mounts_tell_where_mirrors_stand(lessons, learned, folder):
     site = site.changed(posture={"csv": str(folder / "control.csv"), "sigma_rad": 0.02})
     frames, _ = measured_frames(recording, site, follow_links=False)
     two = replace(frames, carrier=frames.carrier[:2], sigma=frames.sigma[:2], unix_s=frames.unix_s[:2])
-    found = survey_frames([two], site.changed(antenna={"receiver": "dipole"}), Besides(mounts=planned))
+    found = survey_frames([two], site.changed(antenna={"receiver": "dipole"}), SurveyKnowledge(mounts=planned))
     exact = replace(found.mounts, parameter=off, normal_sigma_rad=np.full(found.mounts.normal_sigma_rad.shape, 1e-3))
     as_known = replace(
         found, mounts=exact, pivot_enu_m=site.pivot_enu_m, transmitter_enu_m=np.array(site.transmitter_enu_m),

@@ -11,7 +11,7 @@ import pytest
 from rfpose.dsp import CalibrationStatus
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.multilat import FixStatus, RangeStatus
-from rfpose.multilat.rigid import Knowledge, MirrorProblem
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem
 from rfpose.multilat.rigid.start import rotations_from_differences
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.evaluate import Evaluation, evaluate
@@ -164,7 +164,7 @@ def test_the_start_finds_any_orientation(clock_sigma_m: float) -> None:
         clock_class=[0],
         start_pivot_enu_m=pivot,
         start_rot_enu_from_mirror=np.nan,
-        knowledge=Knowledge(clock_sigma_m=clock_sigma_m),
+        knowledge=MirrorKnowledge(clock_sigma_m=clock_sigma_m),
     )
     found = rotations_from_differences(problem)
     angle = np.arccos(np.clip((np.einsum("mab,mab->m", found, turn) - 1.0) / 2.0, -1.0, 1.0))

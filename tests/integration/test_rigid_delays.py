@@ -5,7 +5,14 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import (
+    MirrorKnowledge,
+    MirrorProblem,
+    full_covariance,
+    rigid_bound,
+    solve_rigid,
+    tilt_sigma_rad,
+)
 from rfpose.multilat.rigid.delays import learn_delays
 from sites import TABLE_2
 
@@ -53,7 +60,7 @@ def run(drift_ps_per_sqrt_min, *, jump_at=None, learn_with=None):
         for name, sigma in (("one", 0.0), ("three", np.inf)):
             cov = rigid_bound(
                 MirrorProblem.expected(
-                    TRANSMITTER, PLACES, pivot, rot, knowledge=Knowledge(clock_sigma_m=sigma), **common
+                    TRANSMITTER, PLACES, pivot, rot, knowledge=MirrorKnowledge(clock_sigma_m=sigma), **common
                 )
             )
             records[name].append(tilt_sigma_rad(cov, rot[:, :, 2]))

@@ -5,7 +5,7 @@ import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation
 from rfpose.multilat.rigid.integers import IntegerMethod, solve_ladder
 
 SPEED = 299_792_458.0
@@ -82,7 +82,7 @@ def wrong_between_receivers(turns):
 @pytest.mark.parametrize("missing", [False, True])
 def test_carrier_from_one_tone_where_rounding_is_not_safe(missing):
     """Tone noise of 1.5 mrad leaves receivers within a tenth of a turn at 433 MHz, too little for rounding each."""
-    options = {"known": Knowledge(clock_sigma_m=0.0), "missing": missing}
+    options = {"known": MirrorKnowledge(clock_sigma_m=0.0), "missing": missing}
     rounded, _, _ = climb(np.random.default_rng(3), 1.5e-3, 1.5e-3, 433e6, search=False, **options)
     assert np.mean(rounded.fixed[:, 1]) < 0.5
     found, turns, error = climb(np.random.default_rng(3), 1.5e-3, 1.5e-3, 433e6, **options)
@@ -99,7 +99,9 @@ def test_carrier_from_one_tone_where_rounding_is_not_safe(missing):
 
 
 def test_the_pose_decides_where_turns_are_too_uncertain_for_a_straight_line():
-    found, turns, error = climb(np.random.default_rng(3), 3.5e-3, 3.5e-3, 433e6, known=Knowledge(clock_sigma_m=0.0))
+    found, turns, error = climb(
+        np.random.default_rng(3), 3.5e-3, 3.5e-3, 433e6, known=MirrorKnowledge(clock_sigma_m=0.0)
+    )
     decided = found.method[:, 1] == IntegerMethod.CONSTRAINED
     assert decided.sum() > 50
     assert not wrong_between_receivers(turns[found.fixed[:, 1]]).any()
@@ -109,13 +111,13 @@ def test_the_pose_decides_where_turns_are_too_uncertain_for_a_straight_line():
 def test_integers_go_wrong_no_more_often_than_stated():
     """Carrier noise of a tenth of a turn: several in a hundred mirrors are wrong, and that was said."""
     found, turns, _ = climb(
-        np.random.default_rng(4), 5e-4, 0.8, 100e6, known=Knowledge(clock_sigma_m=0.0), wrong_risk=0.999
+        np.random.default_rng(4), 5e-4, 0.8, 100e6, known=MirrorKnowledge(clock_sigma_m=0.0), wrong_risk=0.999
     )
     fixed = found.fixed[:, 1]
     wrong, stated = wrong_between_receivers(turns[fixed]).sum(), found.wrong_risk[fixed, 1].sum()
     assert 20 < wrong < stated
     assert np.all(found.adop_cycles[fixed, 1] < 0.3)
-    careful, _, _ = climb(np.random.default_rng(4), 5e-4, 0.8, 100e6, known=Knowledge(clock_sigma_m=0.0))
+    careful, _, _ = climb(np.random.default_rng(4), 5e-4, 0.8, 100e6, known=MirrorKnowledge(clock_sigma_m=0.0))
     assert not careful.fixed[:, 1].any()
     assert np.all(careful.method[:, 1] == IntegerMethod.FLOAT)
     assert np.mean(careful.poses.status == PoseStatus.OK) > 0.99  # float: the tone's pose stays
@@ -123,7 +125,7 @@ def test_integers_go_wrong_no_more_often_than_stated():
 
 def test_unknown_delays_and_equal_carriers():
     """One clock a receiver and one wavelength: only double differences have integers."""
-    known = Knowledge(clock_sigma_m=np.inf)
+    known = MirrorKnowledge(clock_sigma_m=np.inf)
     found, turns, _ = climb(
         np.random.default_rng(5), 2e-3, 2e-3, 433e6, known=known, clock_spread=0.5, carriers=np.full(T, 0.69)
     )

@@ -7,7 +7,7 @@ import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.multilat.rigid.integers import align_points, solve_ladder
 from sites import TABLE_2
 
@@ -67,7 +67,7 @@ def test_scatter_is_the_bound(tones, rf, shared, pivot_sigma):
         wavelength = SPEED / (rf + np.arange(-18e6, 19e6, 4e6))
         observations.append(observe(rng, distance, wavelength, phase_sigma, np.inf, clock, len(tones), wrapped=True))
     surveyed = None if pivot_sigma is None else pivot + pivot_sigma * rng.standard_normal((N, 3))
-    knowledge = Knowledge(
+    knowledge = MirrorKnowledge(
         clock_sigma_m=0.0 if shared else np.inf,
         pivot_enu_m=surveyed,
         pivot_sigma_m=np.inf if pivot_sigma is None else pivot_sigma,

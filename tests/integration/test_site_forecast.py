@@ -12,7 +12,7 @@ from rfpose import geometry
 from rfpose.dsp import TonePhases
 from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.site import Common, Disturbance
+from rfpose.multilat.site import Common, WorldErrors
 from rfpose.pipeline.choice import choose
 from rfpose.pipeline.layout import Rules, layout_map
 from rfpose.pipeline.mirrors import mirror_groups
@@ -171,7 +171,7 @@ def test_receivers_that_are_turned_turn_the_normal() -> None:
     ((_, foreseen),) = foreseen_mirrors(scenario, rot)
     turn = np.array([3e-5, -2e-5, 1e-5])
     place = np.cross(turn, foreseen.knowledge.receiver_mirror_m)
-    found = foreseen.normal_change(Disturbance(place_m=place), linear=True)
+    found = foreseen.normal_change(WorldErrors(place_m=place), linear=True)
     expected = np.einsum("mab,b->ma", rot[:N_MIRROR], np.cross(turn, [0.0, 0.0, 1.0]))
     np.testing.assert_allclose(found, expected, atol=1e-3 * np.linalg.norm(turn))
 
@@ -185,7 +185,7 @@ def test_a_shift_of_all_transmitters_turns_mirrors_only_where_pivots_are_held() 
     change = {}
     for name, told in (("held", scenario), ("free", free)):
         ((_, foreseen),) = foreseen_mirrors(told, rot)
-        change[name] = np.abs(foreseen.normal_change(Disturbance(transmitter_m=shift), linear=True)).max()
+        change[name] = np.abs(foreseen.normal_change(WorldErrors(transmitter_m=shift), linear=True)).max()
     assert change["free"] < 1e-8
     assert change["held"] > 20.0 * change["free"]
 
@@ -206,7 +206,7 @@ def test_moved_transmitters_are_received_as_if_foreseen_anew() -> None:
         ]
     )
     ((_, before),), ((_, after),) = foreseen_mirrors(scenario, rot), foreseen_mirrors(moved, rot)
-    ratio = before.received(Disturbance(transmitter_m=shift)) / after.received()
+    ratio = before.received(WorldErrors(transmitter_m=shift)) / after.received()
     change = before.received() / after.received()
     assert np.abs(change - 1.0).max() > 5e-3
     assert np.abs(ratio - 1.0).max() < 2e-4

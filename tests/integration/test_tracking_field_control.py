@@ -9,7 +9,7 @@ import pytest
 
 from rfpose.cli.track import _event
 from rfpose.feedback.columns import constant
-from rfpose.feedback.fieldcontrol.control import FieldControl
+from rfpose.feedback.fieldcontrol.control import ControlledField
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import TrackingSimulation, operation, score
 from rfpose.scenario import load_scenario
@@ -682,7 +682,7 @@ def test_telling_ahead_delays_nobody_by_more_than_the_words_told(monkeypatch):
 def test_stepping_each_second_changes_nothing_while_all_is_quiet(between_messages, monkeypatch):
     site = scenario(HALF_HOUR, NO_LEAN, {"field_control": {"between_messages": between_messages}}, bus={"lost": 0.2})
     ahead = run(site, ("open-loop", "radio"))
-    monkeypatch.setattr(FieldControl, "quiet_until", lambda self, time_s: min(time_s, self._time_s))
+    monkeypatch.setattr(ControlledField, "quiet_until", lambda self, time_s: min(time_s, self._time_s))
     each = run(site, ("open-loop", "radio"))
     for method in ("open-loop", "radio"):
         equal_courses(ahead, each, method)
@@ -692,7 +692,7 @@ def test_stepping_each_second_changes_nothing_while_all_is_quiet(between_message
 
 
 def test_wind_swings_mirrors_as_edwards_has_it():
-    from rfpose.feedback.structure import Structure
+    from rfpose.feedback.structure import StructureMode
     from rfpose.feedback.wind.spectrum import wind_deflection
 
     bend = (0.05, 0.1)
@@ -707,7 +707,7 @@ def test_wind_swings_mirrors_as_edwards_has_it():
     right = (-n[..., 1] * moved[..., 0] + n[..., 0] * moved[..., 1]) / h
     up = -(n[..., 0] * moved[..., 0] + n[..., 1] * moved[..., 1]) * n[..., 2] / h + h * moved[..., 2]
     keep = h > 0.1  # right and up have a meaning
-    mode = Structure(natural_hz=2.2, damping=0.02)
+    mode = StructureMode(natural_hz=2.2, damping=0.02)
     for got, k in zip((right, up), bend, strict=True):
         want = wind_deflection(1e-3 * k, 6.0, mode, size_m=2.0)[1]
         # some 7000 samples 4 s apart, of which 3.6 s ring down: as 2800 free ones, five sigma of their variance; motor

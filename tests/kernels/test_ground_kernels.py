@@ -7,7 +7,7 @@ import pytest
 
 from rfpose.multilat.equations import rotate
 from rfpose.multilat.ground import Reflector, Surface, _problem, model
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation
 
 SPEED = 299_792_458.0
 TRANSMITTER = np.array([[100.0, 0, 20], [50, 86.6, 30], [-50, 86.6, 20], [-100, 0, 30], [0, -50, 40.0], [0, 0, 50]])
@@ -48,7 +48,7 @@ def make_problem(planes, *, calibration=None, n_mirror=2):
     pivot[:, 2] = 3.0
     rot = np.array([np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(n_mirror)])
     rot *= np.linalg.det(rot)[:, None, None]
-    known = Knowledge(clock_sigma_m=np.inf, pivot_enu_m=pivot, pivot_sigma_m=5e-3)
+    known = MirrorKnowledge(clock_sigma_m=np.inf, pivot_enu_m=pivot, pivot_sigma_m=5e-3)
     mirrors = MirrorProblem.of_observations(
         TRANSMITTER, PLACES, observations, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot, knowledge=known
     )

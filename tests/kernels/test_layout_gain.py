@@ -5,11 +5,11 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.layout import maps
-from rfpose.layout.gain import Reflection, gain_of, normal_gain
+from rfpose.layout.gain import ReflectionBend, gain_of, normal_gain
 from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.layout.sensitivity import transmitter_sensitivity
 from rfpose.measurement import Estimator, Noise
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(
     [
@@ -75,7 +75,7 @@ def solved(mirrors, transmitter, ranges, estimator):
             clock_class=[0],
             start_pivot_enu_m=mirrors.pivot_enu_m,
             start_rot_enu_from_mirror=mirrors.rot_enu_from_mirror,
-            knowledge=Knowledge(clock_sigma_m=estimator.clock_sigma_m),
+            knowledge=MirrorKnowledge(clock_sigma_m=estimator.clock_sigma_m),
         )
     ).normal_enu
 
@@ -113,7 +113,7 @@ def test_loss_and_move_are_those_of_the_map(mirrors):
 
 
 def test_single_receivers_know_no_reflection(mirrors):
-    none = Reflection(place_slope=np.zeros((300, 1, 3, 10, 3)), shared_slope=np.zeros((300, 1, 3, 10, 0)))
+    none = ReflectionBend(place_slope=np.zeros((300, 1, 3, 10, 3)), shared_slope=np.zeros((300, 1, 3, 10, 0)))
     with pytest.raises(InvalidInputError, match="rigid"):
         normal_gain(
             TRANSMITTER, mirrors, np.ones((300, 1, 3, 10)), np.zeros((1, 10)), [0], ESTIMATORS["independent"],

@@ -9,7 +9,7 @@ from rfpose.layout.optimise import CRITERIA
 from rfpose.layout.optimise.search import _rows
 from rfpose.measurement import Estimator, Noise
 from rfpose.multilat import dop, normal_bound, position_bound
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, rigid_bound, tilt_sigma_rad
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -89,7 +89,7 @@ def test_rigid_bound(mirrors, estimator, known, n_tone, calibration):
             sigma_m=np.repeat(sigma[None], N, axis=0),
             transmitter_sigma_m=common,
             clock_class=np.arange(len(sigma)),
-            knowledge=Knowledge(pivot_enu_m=mirrors.pivot_enu_m, **known),
+            knowledge=MirrorKnowledge(pivot_enu_m=mirrors.pivot_enu_m, **known),
         )
     )
     got = normal_map(TRANSMITTER, mirrors, plan, estimator)

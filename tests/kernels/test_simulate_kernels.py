@@ -16,7 +16,7 @@ def random_rays(rng, *, n_transmitter, n_ray, n_tone):
     def turns(*shape):
         return rng.integers(0, 2**64, shape, dtype=np.uint64)
 
-    return _rays.Rays(
+    return _rays.RayTerms(
         amplitude=rng.uniform(0.2, 2.0, (n_transmitter, n_ray)),
         carrier_turn=turns(n_transmitter, n_ray),
         carrier_step=turns(n_transmitter),

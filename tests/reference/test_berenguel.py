@@ -15,7 +15,7 @@ from rfpose.feedback.camera.berenguel import (
     find_target_px,
     step_mm,
 )
-from rfpose.feedback.camera.render import Beam, CameraView, Disturbance, Target, project_px, render
+from rfpose.feedback.camera.render import Beam, CameraView, PictureFlaws, Target, project_px, render
 from rfpose.feedback.camera.search import neighbour_zones_m, search
 from rfpose.feedback.camera.spot import SpotStatus
 from rfpose.feedback.mount import Actuator, Mount, command, posture
@@ -105,7 +105,7 @@ def test_centre_of_the_target(figure):
     worst = 0.0
     for _ in range(10):
         seen = view(aim_m=tuple(rng.uniform(-0.5, 0.5, 2)), roll_rad=rng.uniform(-0.01, 0.01))
-        image = render(TARGET, seen, disturbance=Disturbance(noise=3.0, side_light=120.0), rng=rng)
+        image = render(TARGET, seen, disturbance=PictureFlaws(noise=3.0, side_light=120.0), rng=rng)
         found = find_target_px(image)
         off = (found - project_px(seen, [0.0, 0.0])) * [PLATE.mm_per_px, PLATE.mm_per_px_up]
         worst = max(worst, float(np.linalg.norm(off)))
@@ -123,7 +123,7 @@ def test_corrections_needed(figure):
     # B3: three at most, four in the worst case; 90 % success when the beam is in view. Zeros of some milliradians,
     # low sun on the tower's edge in every third, as bright as the beam: there the picture without beam is taken off
     rng = np.random.default_rng(2)
-    light = Disturbance(noise=3.0, side_light=150.0)
+    light = PictureFlaws(noise=3.0, side_light=150.0)
     clean, grazed = (render(TARGET, view(), disturbance=d, rng=rng) for d in (None, light))
     centre = find_target_px(grazed)
     needed, good = [], 0
@@ -143,7 +143,7 @@ def test_corrections_needed(figure):
 
 
 def test_low_sun_on_the_tower_is_not_taken_for_the_beam():
-    light = Disturbance(noise=3.0, side_light=150.0)
+    light = PictureFlaws(noise=3.0, side_light=150.0)
     rng = np.random.default_rng(4)
     for centre in ((-0.5, 0.3), (0.6, -0.4)):
         image = render(TARGET, view(), Beam(centre_m=centre, distance_m=90.0), disturbance=light, rng=rng)

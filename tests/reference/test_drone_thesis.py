@@ -6,11 +6,11 @@ import pytest
 from rfpose import geometry
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.calibration import PARAMETER_SETS, FitSettings, fit_many
-from rfpose.feedback.drive import GOUWS_AZIMUTH, GOUWS_ELEVATION, Drive, follow
+from rfpose.feedback.drive import GOUWS_AZIMUTH, GOUWS_ELEVATION, AxisDrive, follow
 from rfpose.feedback.drone import (
     CAMERA,
     GPS_SIGMA_ENU_M,
-    Drone,
+    RtkDrone,
     dome_directions,
     drone_sigma_rad,
     fly,
@@ -20,16 +20,16 @@ from rfpose.feedback.drone import (
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect
-from rfpose.sun import Site, sun_position
+from rfpose.sun import Location, sun_position
 
 TARGET = np.array([11.0, 27.0, 4.25])
 START = Mount(pivot_enu_m=np.zeros(3), parameters={"arm_normal_m": 0.4325, "arm_up_m": 0.24})
 FIRST = START.replace(axis_2_zero_rad=np.deg2rad(3.0), axis_1_zero_rad=np.deg2rad(-3.0))
-STELLENBOSCH = Site(latitude_rad=np.deg2rad(-33.927), longitude_rad=np.deg2rad(18.864), altitude_m=119.0)
+STELLENBOSCH = Location(latitude_rad=np.deg2rad(-33.927), longitude_rad=np.deg2rad(18.864), altitude_m=119.0)
 BOUNDS = gouws_bounds(START)
 TEN = (*PARAMETER_SETS["gouws"], *CAMERA)
 BOUNDED = FitSettings(sigma_known=True, huber=np.inf, bounds=BOUNDS, priors=uniform_priors(BOUNDS), max_iteration=200)
-QUIET = Drone(gps_sigma_enu_m=(0.0, 0.0, 0.0))
+QUIET = RtkDrone(gps_sigma_enu_m=(0.0, 0.0, 0.0))
 
 
 def his_year():
@@ -62,7 +62,7 @@ def test_rms_of_the_gps():
 
 def test_drawn_fixes_have_that_noise_and_the_offset():
     rng = np.random.default_rng(0)
-    drone = Drone(camera_enu_m=(0.1, -0.2, -0.3))
+    drone = RtkDrone(camera_enu_m=(0.1, -0.2, -0.3))
     (made,) = fly([FIRST], target_enu_m=TARGET, n_point=4000, rng=rng, drone=drone)
     got = posture(FIRST, made.count)
     toward = geometry.unit(TARGET - got.centre_enu_m)
@@ -123,7 +123,7 @@ def test_a_hundred_random_heliostats(layout, figure):
     for _ in range(100):
         drawn = {name: rng.uniform(low, high) for name, (low, high) in BOUNDS.items() if name not in CAMERA}
         mounts.append(START.replace(**drawn))
-        drone = Drone(camera_enu_m=tuple(rng.uniform(-0.006, 0.006, 3)))
+        drone = RtkDrone(camera_enu_m=tuple(rng.uniform(-0.006, 0.006, 3)))
         made += fly(mounts[-1:], target_enu_m=TARGET, n_point=240, rng=rng, drone=drone, layout=layout)
     found = fit_many([START] * 100, made, free=TEN, settings=BOUNDED)
     error = yearly_beam_error_mrad(mounts, found)
@@ -144,7 +144,7 @@ def test_bounds():
 
 
 def test_an_offset_of_the_camera_is_found():
-    drone = Drone(gps_sigma_enu_m=(1e-3,) * 3, camera_enu_m=(0.08, -0.05, -0.12))
+    drone = RtkDrone(gps_sigma_enu_m=(1e-3,) * 3, camera_enu_m=(0.08, -0.05, -0.12))
     made = fly([FIRST], target_enu_m=TARGET, n_point=240, rng=np.random.default_rng(3), drone=drone, layout="dome")
     free = (*PARAMETER_SETS["edwards-4"], *CAMERA)
     found = fit_many([START], made, free=free, settings=FitSettings(sigma_known=True, huber=np.inf))
@@ -186,9 +186,9 @@ def test_a_dome_is_even():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Drone(gps_sigma_enu_m=(-1.0, 0, 0)), "zero or greater"),
-        (lambda: Drive(pulse_rad=0.0), "pulse_rad"),
-        (lambda: Drive(pulse_rad=1e-3, backlash_rad=-1.0), "backlash_rad"),
+        (lambda: RtkDrone(gps_sigma_enu_m=(-1.0, 0, 0)), "zero or greater"),
+        (lambda: AxisDrive(pulse_rad=0.0), "pulse_rad"),
+        (lambda: AxisDrive(pulse_rad=1e-3, backlash_rad=-1.0), "backlash_rad"),
         (lambda: fly([START], target_enu_m=TARGET, n_point=0, rng=np.random.default_rng(0)), "n_point"),
         (
             lambda: fly(

@@ -25,7 +25,7 @@ from rfpose.feedback.servo.rules import (
     sensor_null_shift_rad,
     speed_command_rms_rad,
 )
-from rfpose.feedback.structure import EDWARDS_MODE, Structure, aerodynamic_damping, mass_ratio
+from rfpose.feedback.structure import EDWARDS_MODE, StructureMode, aerodynamic_damping, mass_ratio
 from rfpose.feedback.wind import perfect_servo, rigidity_gain, sunshine_deflection
 
 SOLSTICE = np.deg2rad(23.45)
@@ -142,7 +142,7 @@ def test_v54_speed_commands():
     ("natural_hz", "damping", "resonant"), [(0.5, 0.05, 10.7), (1.0, 0.026, 8.0), (2.0, 0.013, 5.0)]
 )
 def test_wind_deflection_over_sunny_hours(natural_hz, damping, resonant):
-    mode = Structure(natural_hz=natural_hz, damping=damping)
+    mode = StructureMode(natural_hz=natural_hz, damping=damping)
     found = sunshine_deflection(1.0, mode, size_m=SIZE_M)
     assert found.background_rad == pytest.approx(20.3, rel=0.01)
     assert found.resonant_rad == pytest.approx(resonant, rel=0.01)
@@ -151,7 +151,7 @@ def test_wind_deflection_over_sunny_hours(natural_hz, damping, resonant):
 def test_v55_rigidity_that_a_fast_servo_saves():
     # printed 3-10 from a lost figure; background alone 3.3, with the modes' resonance 1.9 to 2.6
     fast, slow = perfect_servo(0.1), perfect_servo(0.001)
-    mode = Structure(natural_hz=2.0, damping=0.013)
+    mode = StructureMode(natural_hz=2.0, damping=0.013)
     background = [sunshine_deflection(1.0, mode, size_m=SIZE_M, residual=each).background_rad for each in (slow, fast)]
     assert background[0] / background[1] == pytest.approx(3.3, rel=0.02)
     assert rigidity_gain(mode, fast, against=slow, size_m=SIZE_M) == pytest.approx(2.6, rel=0.02)

@@ -8,9 +8,9 @@ from rfpose.feedback.calibration import PARAMETER_SETS, FitSettings, fit
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.feedback.optics import reflect, target_offset_m
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
-SITE = Site(latitude_rad=np.deg2rad(-33.93), longitude_rad=np.deg2rad(18.86), altitude_m=120.0)
+SITE = Location(latitude_rad=np.deg2rad(-33.93), longitude_rad=np.deg2rad(18.86), altitude_m=120.0)
 AIM = np.array([0.0, 0.0, 13.0])
 TABLE_6_1 = {
     "location_up_m": 0.11, "location_east_m": 1.02, "location_north_m": -0.53,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound, solve_rigid, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, rigid_bound, solve_rigid, tilt_sigma_rad
 from rfpose.scenario import load_scenario
 
 SITE = load_scenario(Path(__file__).resolve().parents[2] / "data" / "table2.toml")
@@ -29,7 +29,7 @@ ROWS = [
 @pytest.mark.parametrize("shared", [False, True])
 def test_table_of_fact_4(place, facing, three_clocks, one_clock, shared):
     rot = rot_enu_from_mirror(facing)
-    knowledge = Knowledge(clock_sigma_m=0.0 if shared else np.inf)
+    knowledge = MirrorKnowledge(clock_sigma_m=0.0 if shared else np.inf)
     common = {"transmitter_sigma_m": 1e-12, "clock_class": [0], "knowledge": knowledge}
     sigma = np.full((1, 1, 3, 10), SIGMA)
     place = np.array([place], float)

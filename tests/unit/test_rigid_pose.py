@@ -6,7 +6,7 @@ import pytest
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 from rfpose.multilat.rigid.integers import common_offset, solve_ladder
 
 RNG = np.random.default_rng(1)
@@ -47,7 +47,7 @@ def test_without_calibration_the_pivot_gives_orientation():
     """Transmitter errors of any size cancel between receivers of one mirror (design fact 5)."""
     receiver = PIVOT[:, None] + np.einsum("mab,rb->mra", ROT, PLACES)
     z = np.linalg.norm(receiver[:, :, None] - TRANSMITTER, axis=-1)[:, None] + RNG.uniform(-100, 100, 8)
-    known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3)
+    known = MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3)
     found = solve(z, transmitter_sigma=np.inf, knowledge=known)
     assert found.status[0] == PoseStatus.OK
     assert angle_between_rad(found.normal_enu, ROT[:, :, 2])[0] < 1e-8
@@ -66,7 +66,7 @@ def test_what_is_left_open_is_said():
 
 
 def test_a_mount_holds_the_roll():
-    known = Knowledge(two_axis=True)
+    known = MirrorKnowledge(two_axis=True)
     found = solve(_ranges() + 1e-2 * RNG.normal(size=(1, 1, 3, 8)), sigma=1e-2, knowledge=known)
     assert abs(found.rot_enu_from_mirror[0, 2, 0]) < 1e-5
     free = solve(_ranges() + 1e-2 * RNG.normal(size=(1, 1, 3, 8)), sigma=1e-2)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rfpose.errors import InvalidInputError
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
-GOLDEN = Site(
+GOLDEN = Location(
     latitude_rad=np.deg2rad(39.742476),
     longitude_rad=np.deg2rad(-105.1786),
     altitude_m=1830.14,
@@ -26,8 +26,8 @@ def test_published_example():
 
 
 def test_refraction_lifts_the_sun_at_the_horizon():
-    dark = Site(latitude_rad=GOLDEN.latitude_rad, longitude_rad=GOLDEN.longitude_rad, pressure_pa=0.0)
-    air = Site(latitude_rad=GOLDEN.latitude_rad, longitude_rad=GOLDEN.longitude_rad)
+    dark = Location(latitude_rad=GOLDEN.latitude_rad, longitude_rad=GOLDEN.longitude_rad, pressure_pa=0.0)
+    air = Location(latitude_rad=GOLDEN.latitude_rad, longitude_rad=GOLDEN.longitude_rad)
     t = unix_seconds(["2003-10-17T00:20:00Z"]) + np.arange(0.0, 1500.0, 60.0)
     low = sun_position(t, dark).elevation_rad
     i = int(np.argmin(np.abs(low)))
@@ -60,6 +60,6 @@ def test_times_in_their_forms():
 
 def test_degrees_are_refused():
     with pytest.raises(InvalidInputError, match="deg2rad"):
-        Site(latitude_rad=50.9, longitude_rad=0.1)
+        Location(latitude_rad=50.9, longitude_rad=0.1)
     with pytest.raises(InvalidInputError, match="deg2rad"):
-        Site(latitude_rad=0.9, longitude_rad=-105.0)
+        Location(latitude_rad=0.9, longitude_rad=-105.0)

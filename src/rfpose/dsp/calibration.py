@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rfpose.scenario import Scenario
 
 __all__ = [
-    "Calibration",
     "CalibrationStatus",
     "PhaseAverage",
+    "PhaseCalibration",
     "average_phases",
     "calibrate",
     "frame_times",
@@ -48,7 +48,7 @@ class CalibrationStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class PhaseCalibration:
     """Electronic phase Φ of every transmitter, up to one constant a frame and tone.
 
     Attributes
@@ -399,7 +399,7 @@ def frame_times(tones: TonePhases, scenario: Scenario) -> FloatArray:
     return np.asarray((index - (index[0] if len(index) else 0)) / rate_hz)
 
 
-def calibrate(tones: TonePhases, scenario: Scenario) -> Calibration:
+def calibrate(tones: TonePhases, scenario: Scenario) -> PhaseCalibration:
     """Electronic phases in every frame of a recording from its calibration receivers.
 
     Parameters
@@ -416,4 +416,4 @@ def calibrate(tones: TonePhases, scenario: Scenario) -> Calibration:
     """
     average = phase_average(tones.phase_rad, tones.sigma_rad, scenario)
     phase, sigma, drift, status = interpolate_phase(average.phase_rad, average.sigma_rad, frame_times(tones, scenario))
-    return Calibration(phase_rad=phase, sigma_rad=sigma, drift_rad_per_sqrt_s=drift, status=status)
+    return PhaseCalibration(phase_rad=phase, sigma_rad=sigma, drift_rad_per_sqrt_s=drift, status=status)

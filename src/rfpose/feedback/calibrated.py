@@ -18,11 +18,11 @@ from rfpose.feedback.mount import Mount, check_names
 __all__ = [
     "LEAST_REDUNDANCY",
     "PARAMETER_SETS",
-    "Calibration",
+    "CalibratedMount",
     "FieldCalibration",
     "FitSettings",
     "FitStatus",
-    "Known",
+    "KnownMount",
     "ParameterChoice",
     "RowStatus",
     "resolve_free",
@@ -235,7 +235,7 @@ class ParameterChoice:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class CalibratedMount:
     """A calibrated heliostat.
 
     Attributes
@@ -315,8 +315,8 @@ class Calibration:
         return np.asarray(self.row_status == RowStatus.USED)
 
 
-class Known(Protocol):
-    """What is known of a mount: a `Calibration`, or one read back from a file."""
+class KnownMount(Protocol):
+    """What is known of a mount: a `CalibratedMount`, or one read back from a file."""
 
     @property
     def mount(self) -> Mount: ...  # noqa: D102

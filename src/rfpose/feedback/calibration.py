@@ -21,11 +21,11 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibrated import (
     PARAMETER_SETS,
-    Calibration,
+    CalibratedMount,
     FieldCalibration,
     FitSettings,
     FitStatus,
-    Known,
+    KnownMount,
     RowStatus,
     resolve_free,
 )
@@ -33,22 +33,22 @@ from rfpose.feedback.columns import M, columns_of, scales_of
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, stack_mounts
 from rfpose.feedback.prediction import (
-    Prediction,
+    PredictedNormals,
     normal_differences,
     normal_errors_rad,
     posture_jacobian,
     predict,
 )
-from rfpose.feedback.uncertainty import Problem, noise_with_assumed, uncertainty
+from rfpose.feedback.uncertainty import FitBatch, noise_with_assumed, uncertainty
 
 __all__ = [
     "PARAMETER_SETS",
-    "Calibration",
+    "CalibratedMount",
     "FieldCalibration",
     "FitSettings",
     "FitStatus",
-    "Known",
-    "Prediction",
+    "KnownMount",
+    "PredictedNormals",
     "RowStatus",
     "fit",
     "fit_many",
@@ -79,7 +79,7 @@ def fit(
     *,
     free: str | Sequence[str],
     settings: FitSettings | None = None,
-) -> Calibration:
+) -> CalibratedMount:
     """Fit one heliostat's mount to measurements.
 
     Parameters
@@ -121,7 +121,7 @@ def fit(
             f"{1e3 * after:.0f}: check that motor positions are in the mount's counts, positions in the site frame, "
             "and angles in the unit that is asked for (radians or degrees)"
         )
-    return Calibration(
+    return CalibratedMount(
         mount=fitted,
         measurements=measurements,
         field=field_fit,
@@ -215,7 +215,7 @@ def solve(
     masked = use & enough[:, None]
     start = p.copy()
     start[:, index] = np.clip(start[:, index], low, high)
-    problem = Problem(k=k, count=count, row=row, use=masked, index=index, scale=scale, prior_weight=weight)
+    problem = FitBatch(k=k, count=count, row=row, use=masked, index=index, scale=scale, prior_weight=weight)
     bounds = (low, high, mean)
     fitted, iterations, noise = _minimise(start, problem, bounds, settings)
     carried = problem.carried(fitted, noise)
@@ -254,7 +254,7 @@ def solve(
 
 
 def _minimise(
-    start: FloatArray, problem: Problem, bounds: tuple[FloatArray, FloatArray, FloatArray], settings: FitSettings
+    start: FloatArray, problem: FitBatch, bounds: tuple[FloatArray, FloatArray, FloatArray], settings: FitSettings
 ) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
     """Return fitted parameters, iterations and noise in units of the stated sigma.
 

@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.calibration import Known, posture_jacobian, predict
+from rfpose.feedback.calibration import KnownMount, posture_jacobian, predict
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import PARAMETERS, Commands, command
-from rfpose.sun import Site, Sun, sun_position
+from rfpose.sun import Location, Sun, sun_position
 
 __all__ = ["Design", "Forecast", "forecast", "next_postures"]
 
@@ -57,7 +57,7 @@ class Forecast:
 
 
 def next_postures(
-    calibration: Known,
+    calibration: KnownMount,
     candidates: Measurements,
     *,
     n_posture: int,
@@ -105,7 +105,7 @@ def next_postures(
     return Design(chosen=np.array(chosen, np.int64), trace=np.array(trace))
 
 
-def _scaled_ambiguity(calibration: Known, usual: FloatArray) -> FloatArray:
+def _scaled_ambiguity(calibration: KnownMount, usual: FloatArray) -> FloatArray:
     """Projection onto the undetermined combinations, in usual sizes of the parameters."""
     values, vectors = np.linalg.eigh(calibration.ambiguity)
     null = vectors[:, values > 0.5]
@@ -118,9 +118,9 @@ def _scaled_ambiguity(calibration: Known, usual: FloatArray) -> FloatArray:
 
 
 def forecast(
-    calibration: Known,
+    calibration: KnownMount,
     *,
-    site: Site,
+    site: Location,
     unix_s: npt.ArrayLike,
     target_enu_m: npt.ArrayLike,
     mode: Literal["heliostat", "dish"] = "heliostat",

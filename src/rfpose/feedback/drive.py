@@ -10,11 +10,11 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["GOUWS_AZIMUTH", "GOUWS_ELEVATION", "Drive", "follow"]
+__all__ = ["GOUWS_AZIMUTH", "GOUWS_ELEVATION", "AxisDrive", "follow"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drive:
+class AxisDrive:
     """Resolution and play of one axis.
 
     Attributes
@@ -44,13 +44,13 @@ class Drive:
         return (self.pulse_rad**2 + self.backlash_rad**2) / 12.0
 
 
-GOUWS_AZIMUTH = Drive(pulse_rad=0.440e-3, backlash_rad=1.5e-3)
+GOUWS_AZIMUTH = AxisDrive(pulse_rad=0.440e-3, backlash_rad=1.5e-3)
 """His rotary actuator (§4.2)."""
-GOUWS_ELEVATION = Drive(pulse_rad=0.111e-3)
+GOUWS_ELEVATION = AxisDrive(pulse_rad=0.111e-3)
 """His linear actuator (§4.2)."""
 
 
-def follow(drive: Drive, wanted_rad: npt.ArrayLike, *, start_rad: float | None = None) -> FloatArray:
+def follow(drive: AxisDrive, wanted_rad: npt.ArrayLike, *, start_rad: float | None = None) -> FloatArray:
     """Return where an axis comes to stand that is sent to one angle after the other.
 
     Parameters

@@ -23,14 +23,14 @@ from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels
 from rfpose.feedback.columns import constant
-from rfpose.feedback.drive import Drive
+from rfpose.feedback.drive import AxisDrive
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, aim_rows, stack_mounts
 
 __all__ = [
     "CAMERA",
     "GPS_SIGMA_ENU_M",
-    "Drone",
+    "RtkDrone",
     "dome_directions",
     "drone_sigma_rad",
     "fly",
@@ -50,7 +50,7 @@ _ROUNDS = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drone:
+class RtkDrone:
     """A drone with an RTK receiver and a camera.
 
     Attributes
@@ -148,8 +148,8 @@ def fly(
     rng: np.random.Generator,
     distance_m: float = 32.0,
     layout: Literal["random", "dome"] = "random",
-    drone: Drone | None = None,
-    drives: tuple[Drive, Drive] | None = None,
+    drone: RtkDrone | None = None,
+    drives: tuple[AxisDrive, AxisDrive] | None = None,
 ) -> tuple[Measurements, ...]:
     """Simulate what a drone measures of many heliostats, each from points of its own.
 
@@ -182,7 +182,7 @@ def fly(
     Points from which the mirror cannot show the target (behind it, beyond its motors) are left out and others drawn,
     as a pilot would (§5.1).
     """
-    device = drone or Drone()
+    device = drone or RtkDrone()
     as_positive("distance_m", distance_m)
     if n_point < 1:
         raise InvalidInputError(f"`n_point` must be one or more, got {n_point}")
@@ -241,8 +241,8 @@ def _measure(
     count: FloatArray,
     target: FloatArray,
     distance_m: float,
-    drone: Drone,
-    drives: tuple[Drive, Drive] | None,
+    drone: RtkDrone,
+    drives: tuple[AxisDrive, AxisDrive] | None,
     rng: np.random.Generator,
 ) -> tuple[Measurements, ...]:
     """Fly to where the mirrors, standing as their drives leave them, show the target; read GPS and counts."""

@@ -19,7 +19,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.sun import Site, sun_position
+from rfpose.sun import Location, sun_position
 
 __all__ = [
     "GRIFFITH",
@@ -268,7 +268,7 @@ def clear_beam_w_m2(
     elevation_rad: npt.ArrayLike,
     *,
     sky: Literal["ineichen", "edwards"] = "ineichen",
-    site: Site | None = None,
+    site: Location | None = None,
     linke_turbidity: float = 3.0,
 ) -> FloatArray:
     """Return direct normal irradiance under a clear sky [W/m²]; zero below the horizon.
@@ -306,7 +306,7 @@ def clear_beam_w_m2(
 
 
 def energy(
-    site: Site,
+    site: Location,
     unix_s: npt.ArrayLike,
     *,
     target_enu: npt.ArrayLike | None = None,
@@ -374,7 +374,7 @@ def energy(
     )
 
 
-def representative_days(site: Site, year: int, n_day: int, *, step_s: float = 300.0) -> FloatArray:
+def representative_days(site: Location, year: int, n_day: int, *, step_s: float = 300.0) -> FloatArray:
     """Return times of days spread evenly over a year [s]; their energy times 365.25/n_day is that of the year.
 
     Parameters

@@ -38,7 +38,7 @@ __all__ = [
     "CommandStatus",
     "Commands",
     "Mount",
-    "Posture",
+    "MountPosture",
     "command",
     "mount_frame_from_axis",
     "posture",
@@ -186,7 +186,7 @@ class Mount:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Posture:
+class MountPosture:
     """Where mirrors are and face; rows as the motor positions given.
 
     Attributes
@@ -252,7 +252,7 @@ def mount_frame_from_axis(axis_enu: npt.ArrayLike, zero_enu: npt.ArrayLike) -> F
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def posture(mount: Mount, count: npt.ArrayLike, *, receiver_plane: bool = False) -> Posture:
+def posture(mount: Mount, count: npt.ArrayLike, *, receiver_plane: bool = False) -> MountPosture:
     """Return centre and normal of the mirror at motor positions.
 
     Parameters
@@ -271,7 +271,7 @@ def posture(mount: Mount, count: npt.ArrayLike, *, receiver_plane: bool = False)
         counts.reshape(1, -1, 2).copy(),  # kernels are compiled for arrays that can be written
         1.0 if receiver_plane else 0.0,
     ).reshape(*counts.shape[:-1], 8)
-    return Posture(axis_rad=out[..., :2], normal_enu=out[..., 2:5], centre_enu_m=out[..., 5:])
+    return MountPosture(axis_rad=out[..., :2], normal_enu=out[..., 2:5], centre_enu_m=out[..., 5:])
 
 
 def aim_rows(

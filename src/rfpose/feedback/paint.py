@@ -29,7 +29,7 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.geometry import enu_from_wgs84
 from rfpose.paint import heliostat_place, key_of, origin_of, place_of, properties_of, read_object
-from rfpose.sun import Site, unix_seconds
+from rfpose.sun import Location, unix_seconds
 
 __all__ = ["ALGORITHMS", "CHOICES", "PaintHeliostat", "PaintTarget", "heliostat_ids", "read_heliostat"]
 
@@ -120,7 +120,7 @@ class PaintHeliostat:
 
     id: str
     mount: Mount
-    site: Site
+    site: Location
     targets: Mapping[str, PaintTarget]
     record_ids: npt.NDArray[np.int64]
     unix_s: FloatArray
@@ -224,7 +224,7 @@ def read_heliostat(directory: Path, heliostat: str, *, algorithm: str = "both") 
     return PaintHeliostat(
         id=heliostat,
         mount=mount,
-        site=Site(
+        site=Location(
             latitude_rad=float(np.radians(origin[0])),
             longitude_rad=float(np.radians(origin[1])),
             altitude_m=float(origin[2]),

@@ -8,16 +8,16 @@ import numpy as np
 
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
-from rfpose.feedback.calibrated import Known
+from rfpose.feedback.calibrated import KnownMount
 from rfpose.feedback.columns import M, columns_of, scales_of
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, stack_mounts
 
-__all__ = ["Prediction", "normal_differences", "normal_errors_rad", "posture_jacobian", "predict"]
+__all__ = ["PredictedNormals", "normal_differences", "normal_errors_rad", "posture_jacobian", "predict"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
+class PredictedNormals:
     """Modelled normals and how far to trust them.
 
     Attributes
@@ -65,7 +65,7 @@ def normal_differences(mount: Mount, measurements: Measurements) -> FloatArray:
     return residual * measurements.sigma_rad[:, None]
 
 
-def predict(calibration: Known, postures: Measurements) -> Prediction:
+def predict(calibration: KnownMount, postures: Measurements) -> PredictedNormals:
     """Return modelled normals of postures with the uncertainty that the parameters leave.
 
     Parameters
@@ -80,7 +80,7 @@ def predict(calibration: Known, postures: Measurements) -> Prediction:
     covariance = jacobian @ calibration.covariance @ np.swapaxes(jacobian, -1, -2)
     p, k = stack_mounts([calibration.mount])
     normal = _kernels.posture_batch(p, k, postures.count.copy()[None], 0.0)[0, :, 2:5]
-    return Prediction(
+    return PredictedNormals(
         normal_enu=normal,
         error_rad=normal_errors_rad(calibration.mount, postures),
         cov_enu_rad2=covariance,

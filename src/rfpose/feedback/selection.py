@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
-from rfpose.feedback.calibrated import PARAMETER_SETS, Calibration, FieldCalibration, FitSettings, ParameterChoice
+from rfpose.feedback.calibrated import PARAMETER_SETS, CalibratedMount, FieldCalibration, FitSettings, ParameterChoice
 from rfpose.feedback.calibration import fit, row_status, solve
 from rfpose.feedback.columns import columns_of
 from rfpose.feedback.measurements import Measurements
@@ -82,7 +82,7 @@ def with_priors(mount: Mount, free: Sequence[str], settings: FitSettings | None 
 
 def fit_chosen(
     mount: Mount, measurements: Measurements, *, also: Sequence[str] = (), settings: FitSettings | None = None
-) -> Calibration:
+) -> CalibratedMount:
     """Fit a heliostat with the parameters that its measurements carry, and priors.
 
     Parameters

@@ -18,7 +18,7 @@ from rfpose.errors import InvalidInputError
 __all__ = [
     "AIR_KG_M3",
     "EDWARDS_MODE",
-    "Structure",
+    "StructureMode",
     "aerodynamic_damping",
     "deflect",
     "mass_ratio",
@@ -30,7 +30,7 @@ AIR_KG_M3 = 1.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Structure:
+class StructureMode:
     """Lowest mode of a collector's structure, K(s) = ω₀²/(s² + 2ζω₀s + ω₀²) (Edwards 6.1).
 
     Attributes
@@ -65,7 +65,7 @@ class Structure:
         return np.asarray(1.0 / np.sqrt((1.0 - ratio**2) ** 2 + (2.0 * self.damping * ratio) ** 2))
 
 
-EDWARDS_MODE = Structure(natural_hz=0.1, damping=0.3)
+EDWARDS_MODE = StructureMode(natural_hz=0.1, damping=0.3)
 """The mode for which Edwards designs his servo."""
 
 
@@ -119,7 +119,7 @@ def aerodynamic_damping(
     return np.asarray(plate * speed / (4.0 * np.pi * frequency))
 
 
-def deflect(static_rad: npt.ArrayLike, structure: Structure, *, interval_s: float) -> FloatArray:
+def deflect(static_rad: npt.ArrayLike, structure: StructureMode, *, interval_s: float) -> FloatArray:
     """Return the moving deflection that a changing load makes, the load in line between its samples.
 
     Parameters
@@ -150,7 +150,7 @@ def deflect(static_rad: npt.ArrayLike, structure: Structure, *, interval_s: floa
     return np.asarray(signal.lfilter(top, bottom, static, axis=-1, zi=start)[0])
 
 
-def swing_transition(structure: Structure, *, interval_s: float) -> tuple[FloatArray, FloatArray]:
+def swing_transition(structure: StructureMode, *, interval_s: float) -> tuple[FloatArray, FloatArray]:
     """Return how a mode swings from one sample to the next: exact at the samples, whatever their interval.
 
     State is deflection y and its speed, ``x' = transition @ x + root @ w`` with white w of variance one. The force

@@ -13,13 +13,13 @@ from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibrated import LEAST_REDUNDANCY, FitSettings
 
-__all__ = ["RAYLEIGH_MEDIAN", "Problem", "noise_with_assumed", "uncertainty"]
+__all__ = ["RAYLEIGH_MEDIAN", "FitBatch", "noise_with_assumed", "uncertainty"]
 
 RAYLEIGH_MEDIAN = float(np.sqrt(2.0 * np.log(2.0)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+class FitBatch:
     """What a batch of fits is about, as the kernels read it.
 
     Attributes
@@ -98,7 +98,7 @@ def noise_with_assumed(scatter: FloatArray, use: npt.NDArray[np.bool_], redundan
 
 
 def uncertainty(
-    problem: Problem, p: FloatArray, noise: FloatArray, redundancy: FloatArray, settings: FitSettings
+    problem: FitBatch, p: FloatArray, noise: FloatArray, redundancy: FloatArray, settings: FitSettings
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64], FloatArray, FloatArray]:
     """Covariance, projection onto what is undetermined, rank, condition, lengths."""
     parts = []

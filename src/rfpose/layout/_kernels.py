@@ -24,7 +24,7 @@ BLOCK = 16
 Array = npt.NDArray[np.float64]
 
 
-class Field(NamedTuple):
+class FieldArrays(NamedTuple):
     """Transmitters and mirrors, as the kernels take them.
 
     ``transmitter`` (xyz, transmitter), ``place`` (1 or mirror, receiver, xyz) in the mirror frame, ``pivot`` (mirror,

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
-from rfpose.layout.maps import Mirrors, plane_slope
+from rfpose.layout.maps import PosedMirrors, plane_slope
 from rfpose.measurement import Estimator, Noise, clock_classes
 
-__all__ = ["Gain", "Reflection", "gain_of", "normal_gain"]
+__all__ = ["Gain", "ReflectionBend", "gain_of", "normal_gain"]
 
 _CHUNK = 256
 _FLOOR = 1e-13
@@ -54,7 +54,7 @@ class Gain:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reflection:
+class ReflectionBend:
     """How reflections bend ranges about the expected poses.
 
     Attributes
@@ -69,7 +69,7 @@ class Reflection:
     shared_slope: FloatArray
 
 
-def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, estimator: Estimator) -> Gain:
+def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: PosedMirrors, noise: Noise, estimator: Estimator) -> Gain:
     """Return the gain of an estimator for noise as `rfpose.layout.maps` counts it.
 
     With it, Σ slope² σ² over own noise, and over sums of slopes for what receivers share, is the square of
@@ -95,13 +95,13 @@ def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, noise: Noise, es
 
 def normal_gain(
     transmitter_enu_m: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     sigma_m: npt.ArrayLike,
     transmitter_sigma_m: npt.ArrayLike,
     clock_class: npt.ArrayLike,
     estimator: Estimator,
     *,
-    reflection: Reflection | None = None,
+    reflection: ReflectionBend | None = None,
 ) -> Gain:
     """Return the derivative of each mirror's solved normal by its ranges and priors.
 
@@ -148,7 +148,7 @@ def normal_gain(
             continue
         bent = None
         if reflection is not None:
-            bent = Reflection(place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows])
+            bent = ReflectionBend(place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows])
         parts.append(_rigid(transmitter, part, sigma[rows], common, classes, estimator, bent))
     range_slope, pivot_slope, cov, shared_slope, by_range, by_pivot, schur = (
         np.concatenate(arrays) for arrays in zip(*parts, strict=True)
@@ -170,23 +170,23 @@ def normal_gain(
     )
 
 
-def _part(mirrors: Mirrors, rows: slice) -> Mirrors:
+def _part(mirrors: PosedMirrors, rows: slice) -> PosedMirrors:
     places = mirrors.receiver_mirror_m
-    return Mirrors(
+    return PosedMirrors(
         pivot_enu_m=mirrors.pivot_enu_m[rows],
         rot_enu_from_mirror=mirrors.rot_enu_from_mirror[rows],
         receiver_mirror_m=places if len(places) == 1 else places[rows],
     )
 
 
-def _directions(transmitter: FloatArray, mirrors: Mirrors) -> FloatArray:
+def _directions(transmitter: FloatArray, mirrors: PosedMirrors) -> FloatArray:
     """(mirror, receiver, transmitter, xyz) unit vectors from transmitters to receivers."""
     offset = mirrors.receiver_enu_m[:, :, None] - transmitter
     return np.asarray(offset / np.linalg.norm(offset, axis=-1, keepdims=True))
 
 
 def _independent(
-    transmitter: FloatArray, mirrors: Mirrors, sigma: FloatArray, common: FloatArray
+    transmitter: FloatArray, mirrors: PosedMirrors, sigma: FloatArray, common: FloatArray
 ) -> tuple[FloatArray, ...]:
     """Each receiver by itself, then the plane through them."""
     n_mirror, n_group, n_receiver, n_transmitter = sigma.shape
@@ -217,12 +217,12 @@ def _nothing_shared(n_mirror: int, n_group: int, n_receiver: int, n_transmitter:
 
 def _rigid(
     transmitter: FloatArray,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     sigma: FloatArray,
     common: FloatArray,
     classes: npt.NDArray[np.int64],
     estimator: Estimator,
-    reflection: Reflection | None,
+    reflection: ReflectionBend | None,
 ) -> tuple[FloatArray, ...]:
     """All receivers in one fit; the transmitters' common errors come off as weighted means over receivers."""
     n_mirror, n_group, n_receiver, n_transmitter = sigma.shape

@@ -22,8 +22,8 @@ from rfpose.scenario import Heliostat, Scenario
 __all__ = [
     "ESTIMATORS",
     "Dilution",
-    "Mirrors",
-    "Study",
+    "NormalsStudy",
+    "PosedMirrors",
     "check_site",
     "dilution",
     "disc_points",
@@ -61,7 +61,7 @@ pivots surveyed to 5 mm and a shared clock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mirrors:
+class PosedMirrors:
     """Mirrors in one posture each.
 
     Attributes
@@ -76,10 +76,10 @@ class Mirrors:
     rot_enu_from_mirror: FloatArray
     receiver_mirror_m: FloatArray
 
-    def rows(self, index: IndexArray) -> Mirrors:
+    def rows(self, index: IndexArray) -> PosedMirrors:
         """Return some of the mirrors."""
         places = self.receiver_mirror_m
-        return Mirrors(
+        return PosedMirrors(
             pivot_enu_m=self.pivot_enu_m[index],
             rot_enu_from_mirror=self.rot_enu_from_mirror[index],
             receiver_mirror_m=places if len(places) == 1 else places[index],
@@ -98,7 +98,7 @@ class Mirrors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Study:
+class NormalsStudy:
     """How a site's normals are made: which estimator for which of its mirrors, and the noise; see `study_of`.
 
     Attributes
@@ -115,7 +115,7 @@ class Study:
     noise: Noise
     rows: dict[Estimator, IndexArray]
 
-    def bound(self, mirrors: Mirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
+    def bound(self, mirrors: PosedMirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
         """Return the bound of each mirror's normal (mirror,) [rad]; as `normal_map`."""
         seen = None if visible is None else np.asarray(visible)
         out = np.full(len(mirrors.pivot_enu_m), np.nan)
@@ -124,7 +124,7 @@ class Study:
             out[rows] = normal_map(self.transmitter_enu_m, mirrors.rows(rows), self.noise, estimator, visible=part)
         return out
 
-    def without_each(self, mirrors: Mirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
+    def without_each(self, mirrors: PosedMirrors, *, visible: npt.ArrayLike | None = None) -> FloatArray:
         """Return it with each transmitter lost in turn (transmitter, mirror) [rad]; as `normal_without_each`."""
         seen = None if visible is None else np.asarray(visible)
         out = np.full((len(self.transmitter_enu_m), len(mirrors.pivot_enu_m)), np.nan)
@@ -247,7 +247,7 @@ def _planar(transmitter: FloatArray, point: FloatArray, visible: npt.ArrayLike |
 
 def normal_map(
     transmitter_enu_m: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     noise: Noise,
     estimator: Estimator,
     *,
@@ -308,12 +308,12 @@ def normal_map(
 
 
 def kernel_field(
-    transmitter: FloatArray, mirrors: Mirrors, range2: float = 0.0, seen: npt.NDArray[np.uint8] | None = None
-) -> _kernels.Field:
+    transmitter: FloatArray, mirrors: PosedMirrors, range2: float = 0.0, seen: npt.NDArray[np.uint8] | None = None
+) -> _kernels.FieldArrays:
     """Return what the kernels take; ``range2`` and ``seen`` as there."""
     if seen is None:
         seen = np.empty((0, mirrors.receiver_mirror_m.shape[1], len(transmitter)), np.uint8)
-    return _kernels.Field(
+    return _kernels.FieldArrays(
         transmitter=np.ascontiguousarray(transmitter.T),
         place=mirrors.receiver_mirror_m,
         pivot=mirrors.pivot_enu_m,
@@ -345,7 +345,7 @@ def plane_slope(receiver_mirror_m: FloatArray) -> FloatArray:
 
 def normal_without_each(
     transmitter_enu_m: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     noise: Noise,
     estimator: Estimator,
     *,
@@ -370,7 +370,7 @@ def mirrors_facing(
     aim_enu_m: npt.ArrayLike | None = None,
     sun_enu: npt.ArrayLike | None = None,
     arm_m: float = 0.0,
-) -> Mirrors:
+) -> PosedMirrors:
     """Return mirrors in a posture: a given normal, or reflecting the sun onto an aim point.
 
     Parameters
@@ -414,7 +414,7 @@ def mirrors_facing(
         raise GeometryError(
             f"mirror {bad} has no posture: the sun stands opposite its aim point, or its normal is zero"
         )
-    return Mirrors(
+    return PosedMirrors(
         pivot_enu_m=pivot,
         rot_enu_from_mirror=np.ascontiguousarray(rot),
         receiver_mirror_m=np.ascontiguousarray(places + np.array([0.0, 0.0, float(arm_m)])),
@@ -423,7 +423,7 @@ def mirrors_facing(
 
 def mirrors_of(
     scenario: Scenario, *, normal_enu: npt.ArrayLike | None = None, sun_enu: npt.ArrayLike | None = None
-) -> Mirrors:
+) -> PosedMirrors:
     """Return a scenario's mirrors in a posture.
 
     With the given normal; else facing the aim point under the given sun; else as the scenario says
@@ -467,7 +467,7 @@ def study_of(
     *,
     heliostats: Sequence[Heliostat] | None = None,
     tone_snr_db: float | None = None,
-) -> Study:
+) -> NormalsStudy:
     """Return what maps of a scenario need for an estimator by name: one of `ESTIMATORS`, or `SCENARIO`.
 
     ``heliostats`` are studied instead of the scenario's, so that a site need not be checked anew at each move.
@@ -492,7 +492,7 @@ def study_of(
         rows = {estimator: np.arange(len(heliostats))}
         if not scenario.calibration_receiver:
             noise = replace(noise, calibration_sigma_m=np.zeros_like(noise.tone_sigma_m))
-    return Study(transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows=rows)
+    return NormalsStudy(transmitter_enu_m=scenario.transmitter_enu_m, noise=noise, rows=rows)
 
 
 def in_words(estimator: Estimator, propagation_speed_mps: float) -> str:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.layout.gain import gain_of
-from rfpose.layout.maps import Mirrors, normal_map, normal_without_each
+from rfpose.layout.maps import PosedMirrors, normal_map, normal_without_each
 from rfpose.measurement import Estimator, Noise
 
 __all__ = ["TransmitterSensitivity", "transmitter_sensitivity"]
@@ -39,7 +39,7 @@ class TransmitterSensitivity:
 
 def transmitter_sensitivity(
     transmitter_enu_m: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     noise: Noise,
     estimator: Estimator,
     *,
@@ -86,7 +86,7 @@ def transmitter_sensitivity(
 
 def _survey_slope(
     transmitter: FloatArray,
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     noise: Noise,
     estimator: Estimator,
     calibration_enu_m: npt.ArrayLike | None,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid import Knowledge
+from rfpose.multilat.rigid import MirrorKnowledge
 from rfpose.scenario import Heliostat, Scenario
 
 __all__ = ["SCENARIO", "Estimator", "estimator_of", "estimators_of"]
@@ -59,9 +59,9 @@ class Estimator:
         if not self.roll_sigma_rad > 0.0:
             raise InvalidInputError(f"`roll_sigma_rad` must be greater than zero, got {self.roll_sigma_rad}")
 
-    def knowledge(self, pivot_enu_m: FloatArray) -> Knowledge:
+    def knowledge(self, pivot_enu_m: FloatArray) -> MirrorKnowledge:
         """Return what a solver is told of mirrors whose pivots were surveyed to be here (mirror, xyz) [m]."""
-        return Knowledge(
+        return MirrorKnowledge(
             clock_sigma_m=self.clock_sigma_m,
             pivot_enu_m=pivot_enu_m if np.isfinite(self.pivot_sigma_m) else None,
             pivot_sigma_m=self.pivot_sigma_m,

@@ -19,7 +19,7 @@ from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import CommandStatus
 from rfpose.files import claim
 from rfpose.pipeline.formats.mount_file import StoredMount, read_models
-from rfpose.sun import Site, unix_seconds
+from rfpose.sun import Location, unix_seconds
 
 __all__ = ["CommandPlan", "plan_commands", "write_commands"]
 
@@ -101,7 +101,7 @@ def plan_commands(
     hours: float = 12.0,
     step_s: float = 600.0,
     heliostats: Sequence[str] = (),
-    site: Site | None = None,
+    site: Location | None = None,
     n_next: int = 0,
 ) -> tuple[CommandPlan, ...]:
     """Make commands for times, and say how well the mirrors will point.
@@ -166,7 +166,7 @@ def _times(start: str, hours: float, step_s: float) -> FloatArray:
 def _plan(
     name: str,
     stored: StoredMount,
-    site: Site,
+    site: Location,
     unix_s: FloatArray,
     target: FloatArray,
     mode: Literal["heliostat", "dish"],

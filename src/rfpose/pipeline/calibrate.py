@@ -13,16 +13,16 @@ from rfpose.drawing import blank_figure
 from rfpose.engine import gathered
 from rfpose.errors import ClusterError, InvalidInputError, RecordingError, RfposeError
 from rfpose.feedback.alarms import Alarm, alarms
-from rfpose.feedback.calibration import Calibration, FitSettings, fit, resolve_free, sun_convention
+from rfpose.feedback.calibration import CalibratedMount, FitSettings, fit, resolve_free, sun_convention
 from rfpose.feedback.measurements import Measurements, join
 from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import PaintHeliostat, heliostat_ids, read_heliostat
 from rfpose.feedback.selection import AUTO, fit_chosen, held_out_sigma
 from rfpose.feedback.validation import HeldOut, chronological_split, random_splits
-from rfpose.pipeline.calibration_sources import Gathered, read_camera, read_drone, read_paint, read_radio
+from rfpose.pipeline.calibration_sources import SourceMeasurements, read_camera, read_drone, read_paint, read_radio
 from rfpose.pipeline.formats.mount_file import MountFile, read_models, write_model_file
 from rfpose.shown import Shown, counted, number
-from rfpose.sun import Site
+from rfpose.sun import Location
 from rfpose.tables import Tabled
 
 if TYPE_CHECKING:
@@ -78,8 +78,8 @@ class HeliostatReport:
     record_names: tuple[str, ...]
     skipped: Mapping[str, str]
     sources: Mapping[str, int]
-    site: Site | None
-    calibration: Calibration
+    site: Location | None
+    calibration: CalibratedMount
     random: HeldOut | None
     chronological: HeldOut | None
     alarms: tuple[Alarm, ...]
@@ -385,7 +385,7 @@ def _check_paint_sun(folder: Path, data: PaintHeliostat, made: Measurements) -> 
 
 
 def _calibrate_mounts(
-    mounts: MountFile, sources: Sequence[Gathered], heliostats: Sequence[str], how: _How
+    mounts: MountFile, sources: Sequence[SourceMeasurements], heliostats: Sequence[str], how: _How
 ) -> Calibrations:
     """Calibrate mounts from all sources; the receivers' plane, too, where radio and another source meet."""
     measured = {name for source in sources for name in source.measurements}
@@ -406,7 +406,7 @@ class _Measured:
     """Calibrates a heliostat from all that measured it."""
 
     mounts: MountFile
-    sources: Sequence[Gathered]
+    sources: Sequence[SourceMeasurements]
     skipped: Mapping[str, str]
     how: _How
 
@@ -448,7 +448,7 @@ class _How:
 def _report(
     name: str,
     mount: Mount,
-    site: Site | None,
+    site: Location | None,
     parts: Sequence[_Part],
     skipped: Mapping[str, str],
     how: _How,
@@ -482,7 +482,7 @@ def _report(
     )
 
 
-def _notes(mount: Mount, calibration: Calibration, *, radio_alone: bool) -> list[str]:
+def _notes(mount: Mount, calibration: CalibratedMount, *, radio_alone: bool) -> list[str]:
     """Tell what a reader must know before believing the numbers."""
     notes = [RADIO_ALONE] if radio_alone else []
     made, found = calibration.measurements, calibration.field

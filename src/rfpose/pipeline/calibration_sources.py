@@ -29,12 +29,12 @@ from rfpose.feedback.mount import Mount
 from rfpose.feedback.paint import heliostat_ids, read_heliostat
 from rfpose.foreign import load_toml, read_text
 from rfpose.pipeline.formats.mount_file import MountFile, StoredMount
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
 if TYPE_CHECKING:
     from rfpose.pipeline.formats.result import Result
 
-__all__ = ["Gathered", "MotorLog", "read_camera", "read_drone", "read_paint", "read_radio"]
+__all__ = ["MotorLog", "SourceMeasurements", "read_camera", "read_drone", "read_paint", "read_radio"]
 
 BOARD_NAME, PICTURES_NAME = "board.toml", "pictures.csv"
 _SPOT_SIGMA_M = 0.01
@@ -44,7 +44,7 @@ _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Gathered:
+class SourceMeasurements:
     """One source's measurements, by heliostat.
 
     Attributes
@@ -95,7 +95,7 @@ class MotorLog:
         return (entries[i, 1], entries[i, 2]) if abs(entries[i, 0] - unix_s) <= within_s else None
 
 
-def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s: float = 1.0) -> Gathered:
+def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s: float = 1.0) -> SourceMeasurements:
     """Take solved poses of results, each with the motor positions that were logged nearest to its frame.
 
     Parameters
@@ -135,7 +135,7 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
     if not kept:
         why = next(iter(left_out.values()), "no pose at all")
         raise RecordingError(f"{motors}: no pose has a motor position: {why}; check times and heliostats' names")
-    return Gathered(
+    return SourceMeasurements(
         source="radio",
         measurements={
             name: Measurements.from_normals(
@@ -151,7 +151,9 @@ def read_radio(results: Sequence[Result | str | Path], motors: Path, *, within_s
     )
 
 
-def read_paint(directory: Path, names: Sequence[str], *, algorithm: str = "both") -> tuple[Gathered, MountFile]:
+def read_paint(
+    directory: Path, names: Sequence[str], *, algorithm: str = "both"
+) -> tuple[SourceMeasurements, MountFile]:
     """Take PAINT records to be fitted together with other sources, and the mounts as built.
 
     Parameters
@@ -181,11 +183,11 @@ def read_paint(directory: Path, names: Sequence[str], *, algorithm: str = "both"
         site = data.site
     if not made:
         raise RecordingError(f"{directory}: no heliostat can be used: {next(iter(failed.values()))}")
-    gathered = Gathered(source="PAINT", measurements=made, left_out=left_out, failed=failed)
+    gathered = SourceMeasurements(source="PAINT", measurements=made, left_out=left_out, failed=failed)
     return gathered, MountFile(heliostats=mounts, site=site)
 
 
-def read_drone(path: Path, mounts: Mapping[str, Mount]) -> Gathered:
+def read_drone(path: Path, mounts: Mapping[str, Mount]) -> SourceMeasurements:
     """Take a drone's log: from where it saw which target in which mirror.
 
     Parameters
@@ -208,10 +210,10 @@ def read_drone(path: Path, mounts: Mapping[str, Mount]) -> Gathered:
         made[name] = Measurements.from_points(
             table[:, 1:3], source_enu_m=table[:, 3:6], target_enu_m=table[:, 6:9], sigma_rad=sigma, unix_s=table[:, 0]
         )
-    return Gathered(source="drone", measurements=made)
+    return SourceMeasurements(source="drone", measurements=made)
 
 
-def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) -> Gathered:
+def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Location | None) -> SourceMeasurements:
     """Take a folder of pictures of a target with one heliostat's beam each.
 
     Parameters
@@ -261,7 +263,7 @@ def read_camera(folder: Path, mounts: Mapping[str, Mount], site: Site | None) ->
             raise RecordingError(
                 f"{folder}: heliostat {name}: {error}; see {BOARD_NAME} and {PICTURES_NAME}"
             ) from error
-    return Gathered(source="camera", measurements=made, left_out=left_out)
+    return SourceMeasurements(source="camera", measurements=made, left_out=left_out)
 
 
 def _board(path: Path) -> tuple[list[float], list[float], Board, float]:

@@ -23,7 +23,7 @@ from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import GapError, Recording, open_recording
 from rfpose.scenario import Scenario
 
-__all__ = ["JOURNAL_SAMPLES", "Elsewhere", "journal_key", "measure_tones"]
+__all__ = ["JOURNAL_SAMPLES", "OtherProcesses", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
 """Samples measured here between two entries of the journal, and by each thread elsewhere: about a second's work."""
@@ -64,7 +64,7 @@ def _fingerprint(recording: Recording) -> str:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Elsewhere:
+class OtherProcesses:
     """Measuring in other processes, which open the recording by themselves.
 
     Attributes
@@ -88,7 +88,7 @@ def measure_tones(
     journal: Journal | None = None,
     on_progress: Callable[[int, int], None] | None = None,
     stages: Stopwatch | None = None,
-    elsewhere: Elsewhere | None = None,
+    elsewhere: OtherProcesses | None = None,
 ) -> TonePhases:
     """Measure every tone in every frame of every receiver.
 
@@ -212,7 +212,7 @@ class _Recipe:
     estimator: str
 
 
-def _team(elsewhere: Elsewhere | None) -> contextlib.AbstractContextManager[Team]:
+def _team(elsewhere: OtherProcesses | None) -> contextlib.AbstractContextManager[Team]:
     return team_here() if elsewhere is None else team_of()
 
 
@@ -221,7 +221,7 @@ def _share_here(bench: _Bench, n_receiver: int) -> _Share:
     return _Share(bench.rows_of(JOURNAL_SAMPLES), groups, _measure_here, bench)
 
 
-def _share_elsewhere(bench: _Bench, elsewhere: Elsewhere, team: Team) -> _Share:
+def _share_elsewhere(bench: _Bench, elsewhere: OtherProcesses, team: Team) -> _Share:
     n_task = min(bench.n_receiver, _PER_THREAD * team.n_at_once)
     groups = np.array_split(np.arange(bench.n_receiver), n_task)
     place = _Place(

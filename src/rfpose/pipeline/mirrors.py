@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp import PhaseCalibration, TonePhases
 from rfpose.dsp.calibration import PhaseAverage
 from rfpose.measurement import Estimator, Wavelengths, estimator_of, wavelengths_of
 from rfpose.measurement.wavelengths import CARRIER
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.ground import CalibrationSight
-from rfpose.multilat.rigid import Knowledge, Observation
+from rfpose.multilat.rigid import MirrorKnowledge, Observation
 from rfpose.scenario import Scenario
 
 _Number = TypeVar("_Number", bound=np.generic)
@@ -55,7 +55,7 @@ class MirrorGroup:
         """Whether delays between receivers are learned over frames."""
         return self.estimator.delay_drift_m_per_sqrt_s is not None
 
-    def knowledge(self, n_frame: int) -> Knowledge:
+    def knowledge(self, n_frame: int) -> MirrorKnowledge:
         """Return what is known of these mirrors, one row a frame and heliostat."""
         return self.estimator.knowledge(np.tile(self.pivot_enu_m, (n_frame, 1)))
 
@@ -117,7 +117,7 @@ def is_calibrated(scenario: Scenario) -> bool:
 
 
 def observations(
-    tones: TonePhases, calibration: Calibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
+    tones: TonePhases, calibration: PhaseCalibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
 ) -> list[Observation]:
     """Phases of a group's mirrors as ranges, in the order of its wavelengths; first axis frame × heliostat.
 

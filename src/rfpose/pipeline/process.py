@@ -34,7 +34,7 @@ from rfpose.scenario import Scenario, scenario_of
 if TYPE_CHECKING:
     from rfpose.pipeline.choice import PoseChoice
     from rfpose.pipeline.formats.result import Result
-    from rfpose.pipeline.measure import Elsewhere
+    from rfpose.pipeline.measure import OtherProcesses
 
 __all__ = ["process"]
 
@@ -204,18 +204,18 @@ def _refuse_found_clocks(recording: Recording) -> None:
         )
 
 
-def _elsewhere(recording: Recording | RecordingSource, *, follow_links: bool) -> Elsewhere | None:
+def _elsewhere(recording: Recording | RecordingSource, *, follow_links: bool) -> OtherProcesses | None:
     """Return how others get at the recording, if they are to measure it."""
     if not is_elsewhere():
         return None
-    from rfpose.pipeline.measure import Elsewhere
+    from rfpose.pipeline.measure import OtherProcesses
 
     if isinstance(recording, Recording):
         raise InvalidInputError(
             "`recording` must be paths where others measure: workers open it themselves, by what it says of itself"
         )
     paths = (recording,) if isinstance(recording, str | Path) else recording
-    return Elsewhere(paths=tuple(map(Path, paths)), follow_links=follow_links)
+    return OtherProcesses(paths=tuple(map(Path, paths)), follow_links=follow_links)
 
 
 def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import read_only
-from rfpose.dsp import Calibration, CalibrationStatus, TonePhases, calibrate
+from rfpose.dsp import CalibrationStatus, PhaseCalibration, TonePhases, calibrate
 from rfpose.errors import GeometryError, ScenarioError
 from rfpose.measurement import check_reflectors, reflectors_of
 from rfpose.multilat import (
@@ -230,10 +230,10 @@ def _received(tones: TonePhases) -> npt.NDArray[np.bool_]:
     return np.asarray(np.isfinite(tones.phase_rad).any(axis=3))
 
 
-def _no_calibration(tones: TonePhases) -> Calibration:
+def _no_calibration(tones: TonePhases) -> PhaseCalibration:
     n_frame, _, n_transmitter, n_tone = tones.phase_rad.shape
     unknown = read_only(np.full((n_frame, n_transmitter, n_tone), np.nan))
-    return Calibration(
+    return PhaseCalibration(
         phase_rad=unknown,
         sigma_rad=unknown,
         drift_rad_per_sqrt_s=read_only(np.full(n_tone, np.nan)),
@@ -254,7 +254,7 @@ def _no_ranges(tones: TonePhases) -> RangeDifferences:
     )
 
 
-def _ranges(tones: TonePhases, calibration: Calibration, scenario: Scenario) -> RangeDifferences:
+def _ranges(tones: TonePhases, calibration: PhaseCalibration, scenario: Scenario) -> RangeDifferences:
     return range_differences(
         tones.phase_rad,
         tones.sigma_rad,

@@ -14,12 +14,12 @@ from rfpose.feedback.correlated import AXES_AND_ZEROS, CorrelatedFit
 from rfpose.feedback.mount import Mount
 from rfpose.files import claim
 from rfpose.multilat.site import (
-    Constants,
     FieldAt,
     PostureCorrelation,
     ReferencePoses,
     SiteObservations,
     Survey,
+    SurveyConstants,
     SurveyPrior,
     survey_site,
 )
@@ -34,7 +34,7 @@ from rfpose.pipeline.site.poses import knowledge_of, rotations, settings_of, wav
 from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
-__all__ = ["Besides", "Frames", "survey", "survey_frames"]
+__all__ = ["Frames", "SurveyKnowledge", "survey", "survey_frames"]
 
 
 def survey(
@@ -109,7 +109,7 @@ def survey(
     files = [f for f in (scenario, reference, mounts, motors) if isinstance(f, str | Path)]
     with claim(output, inputs=[*read, *files], force=force):
         parts, site = frames_of(many, scenario, follow_links=follow_links)
-        besides = Besides.read(site, parts, reference, reference_sigma_rad, mounts, motors)
+        besides = SurveyKnowledge.read(site, parts, reference, reference_sigma_rad, mounts, motors)
         found = survey_frames(parts, site, besides, on_progress=on_progress)
         if output is not None:
             write_survey(output, found, force=True)
@@ -117,7 +117,7 @@ def survey(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Besides:
+class SurveyKnowledge:
     """What is known besides recordings.
 
     Attributes
@@ -149,7 +149,7 @@ class Besides:
         reference_sigma_rad: float,
         mounts: str | Path | MountFile | None,
         motors: str | Path | None,
-    ) -> Besides:
+    ) -> SurveyKnowledge:
         """Read the files that `survey` was given."""
         unix_s = np.concatenate([part.unix_s for part in parts])
         given = read_models(mounts) if isinstance(mounts, str | Path) else mounts
@@ -176,7 +176,7 @@ class Besides:
 def survey_frames(
     parts: list[Frames],
     site: Scenario,
-    besides: Besides,
+    besides: SurveyKnowledge,
     *,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> SurveyFile:
@@ -211,14 +211,14 @@ def _survey_group(
     site: Scenario,
     group: MirrorGroup,
     commanded: FloatArray,
-    besides: Besides,
+    besides: SurveyKnowledge,
     on_round: Callable[[int, int], None],
 ) -> Survey:
     told = rotations(commanded[:, group.column].reshape(-1, 3))
     antenna = antenna_of(site)
     known = group.estimator
     first = site.heliostat[int(group.column[0])]
-    given = Constants(
+    given = SurveyConstants(
         receiver_mirror_m=group.places_m,
         pivot_enu_m=group.pivot_enu_m,
         transmitter_enu_m=np.array(site.transmitter_enu_m),
@@ -232,7 +232,7 @@ def _survey_group(
                 "mirrors that are alike are surveyed together; give one for all"
             )
 
-    def field_for(now: Constants) -> FieldAt:
+    def field_for(now: SurveyConstants) -> FieldAt:
         moved = site.changed(
             transmitter=[
                 {**t.model_dump(exclude_none=True), "position_enu_m": place}

@@ -2,7 +2,7 @@
 
 from rfpose.propagation.foresight import Foresight, foresee
 from rfpose.propagation.rays import RayKind, Rays
-from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, Soil, Stand, Surroundings, bystanders
+from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, ReceiverStand, Soil, Surroundings, bystanders
 
 __all__ = [
     "BoxesStanding",
@@ -10,8 +10,8 @@ __all__ = [
     "PlatesStanding",
     "RayKind",
     "Rays",
+    "ReceiverStand",
     "Soil",
-    "Stand",
     "Surroundings",
     "bystanders",
     "foresee",

@@ -59,7 +59,7 @@ _SCALE, _COEFFICIENT = _weideman(20)
 _HALF_TURN = complex(math.sqrt(0.5), math.sqrt(0.5))  # e^{jπ/4}
 
 
-class Scene(NamedTuple):
+class StandingThings(NamedTuple):
     """What stands on the site.
 
     Plates come first among the things, then boxes, then the ground; among the faces the ground is first, then one for
@@ -102,7 +102,7 @@ class Scene(NamedTuple):
     permittivity: Complex128
 
 
-class Wanted(NamedTuple):
+class RayChoice(NamedTuple):
     """Which rays to look for."""
 
     hide: bool
@@ -126,7 +126,7 @@ class Receivers(NamedTuple):
     near: Int64
 
 
-class Found(NamedTuple):
+class TracedRays(NamedTuple):
     """Rays by link (mirror, receiver, transmitter, ray); ``n_ray`` may exceed the room there is."""
 
     n_ray: Int64

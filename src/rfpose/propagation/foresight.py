@@ -13,7 +13,7 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.propagation import _kernels
 from rfpose.propagation.rays import Rays
-from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, Soil, Stand, Surroundings
+from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, ReceiverStand, Soil, Surroundings
 
 __all__ = ["Foresight", "foresee"]
 
@@ -88,7 +88,7 @@ class Foresight:
 def foresee(
     transmitter_enu_m: npt.ArrayLike,
     carrier_rf_hz: npt.ArrayLike,
-    mirrors: Stand,
+    mirrors: ReceiverStand,
     surroundings: Surroundings,
     options: Foresight | None = None,
 ) -> Rays:
@@ -138,7 +138,7 @@ def foresee(
     receivers, middle, spread = _receivers(mirrors, surroundings, wanted)
     n_mirror, n_receiver, n_transmitter = len(receivers.pivot), receivers.place.shape[1], len(transmitter)
     block = max(1, _BLOCK_LINKS // max(1, n_receiver * n_transmitter))
-    kinds = _kernels.Wanted(
+    kinds = _kernels.RayChoice(
         hide=wanted.visibility,
         ground=wanted.ground and surroundings.soil is not None,
         specular=wanted.specular,
@@ -170,7 +170,9 @@ def foresee(
     return _gathered(count, parts)
 
 
-def _scene(transmitter: FloatArray, carrier_hz: FloatArray, things: Surroundings, wanted: Foresight) -> _kernels.Scene:
+def _scene(
+    transmitter: FloatArray, carrier_hz: FloatArray, things: Surroundings, wanted: Foresight
+) -> _kernels.StandingThings:
     plates, boxes, soil = things.plates, things.boxes, things.soil
     n_plate, n_box = len(plates.centre_enu_m), len(boxes.base_enu_m)
     half = 0.5 * plates.size_m
@@ -200,7 +202,7 @@ def _scene(transmitter: FloatArray, carrier_hz: FloatArray, things: Surroundings
     if soil is not None:
         permittivity[-1] = _complex(soil.permittivity, soil.conductivity_s_per_m, carrier_hz)
     edges = _edges(plates, half, boxes, box_centre, soil)
-    return _kernels.Scene(
+    return _kernels.StandingThings(
         transmitter=transmitter,
         wavenumber=2.0 * np.pi * carrier_hz / wanted.propagation_speed_mps,
         dipole=wanted.antenna == "half_wave",
@@ -290,7 +292,7 @@ def _cells(centre: FloatArray, origin: FloatArray, cell: float) -> tuple[IndexAr
     return np.ascontiguousarray(start), member
 
 
-def _check_above(transmitter: FloatArray, mirrors: Stand, things: Surroundings) -> None:
+def _check_above(transmitter: FloatArray, mirrors: ReceiverStand, things: Surroundings) -> None:
     if things.soil is None:
         return
     normal = geometry.unit(things.soil.normal_enu)
@@ -304,7 +306,7 @@ def _check_above(transmitter: FloatArray, mirrors: Stand, things: Surroundings) 
 
 
 def _receivers(
-    mirrors: Stand, things: Surroundings, wanted: Foresight
+    mirrors: ReceiverStand, things: Surroundings, wanted: Foresight
 ) -> tuple[_kernels.Receivers, FloatArray, FloatArray]:
     """Return what the kernel wants of the mirrors, and the spheres about their receivers."""
     place = _out_of_plates(mirrors, things)
@@ -327,7 +329,7 @@ def _receivers(
     return receivers, middle, spread
 
 
-def _out_of_plates(mirrors: Stand, things: Surroundings) -> FloatArray:
+def _out_of_plates(mirrors: ReceiverStand, things: Surroundings) -> FloatArray:
     """(mirror, receiver, xyz) places, those within the mirror's own plate a hair's breadth in front of it [m]."""
     place = np.array(mirrors.receiver_mirror_m, np.float64)
     plates, rows = things.plates, np.flatnonzero(mirrors.own_plate >= 0)
@@ -356,8 +358,8 @@ def _near(middle: FloatArray, centre: FloatArray, reach_m: float) -> tuple[Index
     return np.concatenate([[0], np.cumsum(count)]).astype(np.int64), near
 
 
-def _empty(shape: tuple[int, int, int], room: int) -> _kernels.Found:
-    return _kernels.Found(
+def _empty(shape: tuple[int, int, int], room: int) -> _kernels.TracedRays:
+    return _kernels.TracedRays(
         n_ray=np.zeros(shape, np.int64),
         source=np.empty((*shape, room, 3)),
         place=np.empty((*shape, room, 3)),
@@ -368,7 +370,7 @@ def _empty(shape: tuple[int, int, int], room: int) -> _kernels.Found:
     )
 
 
-def _taken(found: _kernels.Found, n_row: int) -> tuple[npt.NDArray[np.generic], ...]:
+def _taken(found: _kernels.TracedRays, n_row: int) -> tuple[npt.NDArray[np.generic], ...]:
     """Return the rays of the first rows, link after link."""
     used = np.arange(found.extra.shape[3]) < found.n_ray[:n_row, ..., None]
     return tuple(array[:n_row][used] for array in found[1:])

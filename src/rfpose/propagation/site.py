@@ -8,14 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, Soil, Stand, Surroundings
+from rfpose.propagation.surroundings import BoxesStanding, PlatesStanding, ReceiverStand, Soil, Surroundings
 from rfpose.scenario import Scenario
 
-__all__ = ["Placed", "boxes_of", "place_things", "soil_of", "stand_of"]
+__all__ = ["PlacedThings", "boxes_of", "place_things", "soil_of", "stand_of"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Placed:
+class PlacedThings:
     """A scenario's things in their postures.
 
     Attributes
@@ -35,7 +35,7 @@ class Placed:
 
 def place_things(
     scenario: Scenario, rot_enu_from_mirror: npt.ArrayLike, *, pivot_enu_m: npt.ArrayLike | None = None
-) -> Placed:
+) -> PlacedThings:
     """Stand up what a scenario has about its receivers.
 
     Parameters
@@ -58,7 +58,7 @@ def place_things(
     arm = np.array([m.arm_m for m in mirrors])
     known = np.isfinite(size).all(axis=1) & np.isfinite(rot).all(axis=(1, 2))
     number = np.where(known, np.cumsum(known) - 1, -1)
-    return Placed(
+    return PlacedThings(
         surroundings=Surroundings(
             plates=PlatesStanding(
                 centre_enu_m=(pivot + arm[:, None] * rot[:, :, 2])[known],
@@ -108,7 +108,7 @@ def stand_of(
     own_plate: npt.NDArray[np.int64],
     *,
     pivot_enu_m: npt.ArrayLike | None = None,
-) -> Stand:
+) -> ReceiverStand:
     """Return where a scenario's receivers stand, those of heliostats with fewer than others filled up with NaN.
 
     Parameters
@@ -128,7 +128,7 @@ def stand_of(
     pivot: FloatArray = scenario.pivot_enu_m
     if pivot_enu_m is not None:
         pivot = as_float_array("pivot_enu_m", pivot_enu_m, (n, 3), finite=False)
-    return Stand(
+    return ReceiverStand(
         pivot_enu_m=pivot,
         rot_enu_from_mirror=as_float_array("rot_enu_from_mirror", rot_enu_from_mirror, (n, 3, 3), finite=False),
         receiver_mirror_m=place,

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 
-__all__ = ["BoxesStanding", "PlatesStanding", "Soil", "Stand", "Surroundings", "bystanders"]
+__all__ = ["BoxesStanding", "PlatesStanding", "ReceiverStand", "Soil", "Surroundings", "bystanders"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,7 +138,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stand:
+class ReceiverStand:
     """Where receivers stand: fixed to mirrors in given poses.
 
     Attributes
@@ -166,7 +166,7 @@ class Stand:
             raise InvalidInputError(f"`own_plate` must have shape ({n},), got {np.shape(self.own_plate)}")
 
 
-def bystanders(place_enu_m: npt.ArrayLike) -> Stand:
+def bystanders(place_enu_m: npt.ArrayLike) -> ReceiverStand:
     """Return receivers without a mirror, such as calibration receivers, each as a stand of its own.
 
     Parameters
@@ -176,7 +176,7 @@ def bystanders(place_enu_m: npt.ArrayLike) -> Stand:
     """
     place = as_float_array("place_enu_m", place_enu_m, ("bystander", 3))
     n = len(place)
-    return Stand(
+    return ReceiverStand(
         pivot_enu_m=place,
         rot_enu_from_mirror=np.broadcast_to(np.eye(3), (n, 3, 3)),
         receiver_mirror_m=np.zeros((n, 1, 3)),

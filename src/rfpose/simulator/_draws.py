@@ -10,14 +10,14 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.scenario import Scenario
 
-__all__ = ["Draws", "draw", "noise_generator"]
+__all__ = ["RecordingDraws", "draw", "noise_generator"]
 
 _CARRIER, _OSCILLATOR, _TONE, _DELAY, _NOISE = range(5)
 _TWO_PI = 2.0 * np.pi
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class RecordingDraws:
     """What chance decided for one recording.
 
     Attributes
@@ -41,7 +41,7 @@ class Draws:
     delay_s: FloatArray
 
 
-def draw(scenario: Scenario, *, seed: int, frame_time_s: FloatArray) -> Draws:
+def draw(scenario: Scenario, *, seed: int, frame_time_s: FloatArray) -> RecordingDraws:
     """Draw all random quantities but the noise.
 
     Parameters
@@ -69,7 +69,7 @@ def draw(scenario: Scenario, *, seed: int, frame_time_s: FloatArray) -> Draws:
     oscillators = list(dict.fromkeys(r.oscillator for r in scenario.receivers))
     of_receiver = np.array([oscillators.index(r.oscillator) for r in scenario.receivers])
     unit_draw = _stream(seed, _OSCILLATOR).uniform(size=(len(oscillators), 3))[of_receiver]
-    return Draws(
+    return RecordingDraws(
         carrier_phase_rad=carrier_phase_rad,
         tone_phase_rad=_wrap(tone_phase_rad),
         clock_ppm=simulation.clock_offset_ppm * (2.0 * unit_draw[:, 0] - 1.0),

@@ -16,14 +16,14 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.scenario import Scenario
 
-__all__ = ["Rays", "make_rays"]
+__all__ = ["RayTerms", "make_rays"]
 
 Uint64 = npt.NDArray[np.uint64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class RayTerms:
     """What `_kernels.sum_of_rays` needs; see there for shapes and units."""
 
     amplitude: FloatArray
@@ -47,7 +47,7 @@ def make_rays(
     sampling_phase: float,
     run_start_index: int,
     sample_in_run: int,
-) -> Rays:
+) -> RayTerms:
     """Return the rays of one receiver in one frame.
 
     The receiver's clock counts from ``run_start_index``, where a stretch of samples without a pause began; the
@@ -65,7 +65,7 @@ def make_rays(
     tone_phase_rad : (transmitter, tone)
         Φ.
     delay_s, clock_ppm, oscillator_phase_rad, sampling_phase
-        Of the receiver, see `Draws`.
+        Of the receiver, see `RecordingDraws`.
     run_start_index
         Samples since the epoch at the nominal rate.
     sample_in_run
@@ -83,7 +83,7 @@ def make_rays(
     carrier_rad = (carrier_phase_rad + oscillator_phase_rad)[:, None] + np.angle(gain)
     carrier_turns = carrier_rad / (2.0 * np.pi) - carrier_rf_hz[:, None] * tau
     tone_turns = tone_phase_rad[:, None, :] / (2.0 * np.pi) - tau[:, :, None] * scenario.tone_hz
-    return Rays(
+    return RayTerms(
         amplitude=np.abs(gain) * pass_factor[:, None],
         carrier_turn=_turns_from_fractions([f * time for f in beat])[:, None] + _turns_from_floats(carrier_turns),
         carrier_step=_turns_from_fractions([f / rate for f in beat]),

@@ -58,7 +58,7 @@ class _Job:
     i_frame: int
     i_receiver: int
     i_chunk: int
-    rays: _rays.Rays
+    rays: _rays.RayTerms
     kept: tuple[tuple[int, int], ...]
     """First and past-the-last sample in the frame of each stretch that is not lost."""
 
@@ -124,7 +124,7 @@ class Simulator:
     counts_per_unit: float
     noise_sigma: float
     total_samples: int
-    draws: _draws.Draws
+    draws: _draws.RecordingDraws
 
     def __init__(self, scenario: Scenario, *, seed: int, folder: Path | None = None) -> None:
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
@@ -240,7 +240,7 @@ class Simulator:
             return self._tables.paths(i_frame)
         return paths_from_geometry(self._scenario, self._receiver_enu_m[i_frame])
 
-    def _rays_of(self, i_frame: int, i_receiver: int, paths: Paths) -> _rays.Rays:
+    def _rays_of(self, i_frame: int, i_receiver: int, paths: Paths) -> _rays.RayTerms:
         draws = self.draws
         run_start_index = int(self._run_start_index[i_frame])
         return _rays.make_rays(

@@ -23,7 +23,7 @@ from rfpose.feedback.design import forecast, next_postures
 from rfpose.feedback.measurements import Measurements, join
 from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, command, posture
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits, rolling_refit
-from rfpose.sun import Site
+from rfpose.sun import Location
 
 START = Mount(pivot_enu_m=np.array([20.0, 80.0, 3.0]))
 TRUE = START.replace(
@@ -244,7 +244,7 @@ def test_prediction_knows_its_uncertainty_and_forecast_uses_it():
     found = fit(START, spots(rng, 40), free="edwards-4", settings=EXACT)
     ahead = predict(found, spots(rng, 20))
     assert np.all((ahead.sigma_rad > 2e-5) & (ahead.sigma_rad < 3e-4))
-    site = Site(latitude_rad=0.6, longitude_rad=0.0)
+    site = Location(latitude_rad=0.6, longitude_rad=0.0)
     day = forecast(found, site=site, unix_s=1.71e9 + 3600.0 * np.arange(24), target_enu_m=TARGETS[0])
     up = day.sun.elevation_rad > 0.0
     assert 8 <= up.sum() <= 16

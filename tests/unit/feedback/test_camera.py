@@ -10,7 +10,7 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.calibration import FitSettings, fit_many
 from rfpose.feedback.camera.malan import Board, beam_threshold, find_spot, marker_threshold, weighted_centroid
 from rfpose.feedback.camera.model import camera_measurements, spots_enu_m
-from rfpose.feedback.camera.render import Beam, CameraView, Disturbance, Target, project_px, render
+from rfpose.feedback.camera.render import Beam, CameraView, PictureFlaws, Target, project_px, render
 from rfpose.feedback.camera.search import neighbour_zones_m, search, spiral_offsets_m
 from rfpose.feedback.camera.spot import SpotStatus, read_picture
 from rfpose.feedback.mount import Mount
@@ -57,7 +57,7 @@ def test_markers_beat_no_perspective():
 
 @pytest.mark.parametrize(
     ("worse", "limit_mm"),
-    [(Disturbance(noise=6.0), 6.0), (Disturbance(side_light=140.0), 6.0), (Disturbance(flare=30.0), 25.0)],
+    [(PictureFlaws(noise=6.0), 6.0), (PictureFlaws(side_light=140.0), 6.0), (PictureFlaws(flare=30.0), 25.0)],
     ids=["noise", "side-light", "flare"],
 )
 def test_disturbances(worse, limit_mm):

@@ -14,9 +14,9 @@ from rfpose.feedback.energy import (
     spillage,
 )
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.sun import Site
+from rfpose.sun import Location
 
-CANBERRA = Site(latitude_rad=np.deg2rad(-35.0), longitude_rad=np.deg2rad(149.0))
+CANBERRA = Location(latitude_rad=np.deg2rad(-35.0), longitude_rad=np.deg2rad(149.0))
 
 
 def test_budget_adds_squares():
@@ -84,7 +84,7 @@ def test_two_discs_overlap_as_points_in_them_do(ratio):
 
 @pytest.mark.parametrize(("latitude", "expected"), [(-25.0, 13.6e9), (-35.0, 13.3e9)])
 def test_v1_v2_a_year_of_clear_sky(latitude, expected):
-    site = Site(latitude_rad=np.deg2rad(latitude), longitude_rad=np.deg2rad(149.0))
+    site = Location(latitude_rad=np.deg2rad(latitude), longitude_rad=np.deg2rad(149.0))
     time = representative_days(site, 2026, 12)
     found = energy(site, time, sky="edwards", min_elevation_rad=np.deg2rad(5.0))
     assert found.offered_j_m2[0] * 365.25 / 12 == pytest.approx(expected, rel=0.01)

@@ -5,9 +5,9 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings
-from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings
+from rfpose.feedback.fieldcontrol.control import ControlledField, FieldSettings
 from rfpose.feedback.fieldcontrol.local import spiral_cells
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.feedback.fieldcontrol.motion import move_axes
 
 SUN = np.array([0.1, 0.5, 0.8])
@@ -21,7 +21,7 @@ class Rig:
     def __init__(self, n=40, *, mode=Mode.STOW, seed=1, settings=None, **bus):
         rng = np.random.default_rng(seed)
         pivot = np.stack([np.linspace(-90.0, 90.0, n), np.full(n, -80.0), np.full(n, 2.0)], axis=1)
-        self.control = FieldControl(
+        self.control = ControlledField(
             aim_enu_m=RECEIVER,
             pivot_enu_m=pivot,
             calibration_enu_m=TARGET,
@@ -55,11 +55,11 @@ class Rig:
 def test_leaves_stow_azimuth_first_and_returns_elevation_first():
     rig = Rig()
     rig.run(5)
-    assert rig.control.command(Event.APPROACH).accepted.all()
+    assert rig.control.command(ModeEvent.APPROACH).accepted.all()
     rig.run(60)
     assert rig.modes() == {"TRACK"}
     np.testing.assert_allclose(rig.axis, rig.aim_axis, atol=2e-3)
-    rig.control.command(Event.STOW)
+    rig.control.command(ModeEvent.STOW)
     rig.run(60)
     assert rig.modes() == {"STOW"}
     np.testing.assert_allclose(rig.axis, 0.0, atol=1e-12)
@@ -102,13 +102,13 @@ def test_emergency_drops_elevation_alone_then_stows():
     assert rig.modes() == {"EMERGENCY"}
     np.testing.assert_allclose(rig.axis[:, 0], rig.aim_axis[:, 0])
     np.testing.assert_allclose(rig.axis[:, 1], rig.aim_axis[:, 1] - 0.15)
-    refused = rig.control.command(Event.REFOCUS)
+    refused = rig.control.command(ModeEvent.REFOCUS)
     assert not refused.accepted.any()
     assert "receiver too hot since 4.5 s; only stow is possible" in refused.reasons[0]
     rig.run(90)
     assert rig.modes() == {"STOW"}
     rig.control.release()
-    assert rig.control.command(Event.APPROACH).accepted.all()
+    assert rig.control.command(ModeEvent.APPROACH).accepted.all()
 
 
 def test_a_silent_cluster_helps_itself_after_the_watchdogs_time():
@@ -128,13 +128,13 @@ def test_a_silent_cluster_helps_itself_after_the_watchdogs_time():
     rig.control.repair_cluster(1)
     rig.run(8)
     np.testing.assert_array_equal(rig.control.reported_mode == Mode.STOW, mine)
-    assert rig.control.command(Event.APPROACH, mine).accepted[mine].all()
+    assert rig.control.command(ModeEvent.APPROACH, mine).accepted[mine].all()
 
 
 def test_what_a_dying_controller_was_about_to_say_is_not_heard():
     rig = Rig(n=64, mode=Mode.TRACK)
     rig.run(6)
-    rig.control.command(Event.POINT)
+    rig.control.command(ModeEvent.POINT)
     rig.control.emergency()
     rig.control.fail_cluster(1)
     mine = rig.control.cluster == 1
@@ -156,7 +156,7 @@ def test_without_the_centre_clusters_go_on_then_stow():
     rig.run(29, wind_mps=20.0)
     assert rig.modes() == {"TRACK"}
     assert np.all(rig.orders.sun_age_s < 5.0)
-    assert "the centre is dead since 4.5 s" in rig.control.command(Event.DEFOCUS).reasons[0]
+    assert "the centre is dead since 4.5 s" in rig.control.command(ModeEvent.DEFOCUS).reasons[0]
     with pytest.raises(InvalidInputError, match=r"the centre is dead since 4.5 s and orders nothing"):
         rig.control.emergency()
     rig.run(3)
@@ -178,7 +178,7 @@ def test_wind_of_ten_metres_a_second_stows_and_calm_releases():
     assert rig.modes() == {"STOWING"}
     rig.run(60, wind_mps=8.5)
     assert rig.modes() == {"STOW"}
-    assert "strong wind" in rig.control.command(Event.APPROACH).reasons[0]
+    assert "strong wind" in rig.control.command(ModeEvent.APPROACH).reasons[0]
     rig.run(29, wind_mps=7.0)
     assert rig.control.alarms == ("strong wind",)
     rig.run(3, wind_mps=7.0)
@@ -208,20 +208,20 @@ def test_night_stows_and_refuses():
         rig.axis = move_axes(rig.axis, target, 0.5, rate_rad_s=0.1)
         rig.time_s += 0.5
     assert rig.modes() == {"STOW"}
-    assert "sun below the horizon" in rig.control.command(Event.APPROACH).reasons[0]
+    assert "sun below the horizon" in rig.control.command(ModeEvent.APPROACH).reasons[0]
 
 
 def test_contradicting_orders_are_refused_and_safer_ones_replace():
     rig = Rig(mode=Mode.TRACK)
     rig.run(5)
     control = rig.control
-    assert control.command(Event.POINT, [3]).accepted[3]
-    assert control.command(Event.POINT, [3]).accepted[3]  # the same again is no contradiction
-    answer = control.command(Event.HOLD, [3])
+    assert control.command(ModeEvent.POINT, [3]).accepted[3]
+    assert control.command(ModeEvent.POINT, [3]).accepted[3]  # the same again is no contradiction
+    answer = control.command(ModeEvent.HOLD, [3])
     assert answer.reasons == {3: "HOLD refused: contradicts POINT, which is on its way"}
-    assert control.command(Event.DEFOCUS, [3]).accepted[3]
-    assert control.command(Event.STOW, [3]).accepted[3]
-    assert "contradicts STOW" in control.command(Event.DEFOCUS, [3]).reasons[3]
+    assert control.command(ModeEvent.DEFOCUS, [3]).accepted[3]
+    assert control.command(ModeEvent.STOW, [3]).accepted[3]
+    assert "contradicts STOW" in control.command(ModeEvent.DEFOCUS, [3]).reasons[3]
     assert np.flatnonzero(control.waiting).tolist() == [3]
     rig.run(8)
     assert np.flatnonzero(control.mode == Mode.STOWING).tolist() == [3]
@@ -230,7 +230,7 @@ def test_contradicting_orders_are_refused_and_safer_ones_replace():
 
 def test_modes_refuse_what_does_not_fit():
     rig = Rig(mode=Mode.TRACK)
-    answer = rig.control.command(Event.APPROACH, [1, 2])
+    answer = rig.control.command(ModeEvent.APPROACH, [1, 2])
     assert set(answer.reasons) == {1, 2}
     assert not answer.accepted.any()
     assert answer.reasons[1] == "APPROACH refused: it tracks its aim already"
@@ -239,7 +239,7 @@ def test_modes_refuse_what_does_not_fit():
 def test_heliostat_refuses_what_the_centre_could_not_know():
     rig = Rig(mode=Mode.TRACK)
     rig.run(4)
-    rig.control.command(Event.POINT, [0])
+    rig.control.command(ModeEvent.POINT, [0])
     rig.control.power_off([0])
     rig.control.power_on([0])
     rig.run(5)
@@ -250,31 +250,31 @@ def test_heliostat_refuses_what_the_centre_could_not_know():
 def test_one_place_on_the_calibration_target():
     rig = Rig(mode=Mode.TRACK)
     rig.run(5)
-    answer = rig.control.command(Event.CALIBRATE, [4, 9])
+    answer = rig.control.command(ModeEvent.CALIBRATE, [4, 9])
     assert np.flatnonzero(answer.accepted).tolist() == [4]
     assert answer.reasons == {9: "CALIBRATE refused: the calibration target is taken"}
     orders = rig.run(8)
     assert orders.mode[4] == Mode.CALIBRATE
     np.testing.assert_allclose(orders.aim_enu_m[4], TARGET)
-    assert "is taken" in rig.control.command(Event.CALIBRATE, [9]).reasons[9]
-    assert rig.control.command(Event.TRACK, [4]).accepted[4]
+    assert "is taken" in rig.control.command(ModeEvent.CALIBRATE, [9]).reasons[9]
+    assert rig.control.command(ModeEvent.TRACK, [4]).accepted[4]
     rig.run(8)
-    assert rig.control.command(Event.CALIBRATE, [9]).accepted[9]
+    assert rig.control.command(ModeEvent.CALIBRATE, [9]).accepted[9]
 
 
 def test_no_calibration_target_no_calibration():
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=RECEIVER, pivot_enu_m=np.zeros((2, 3)), mode=Mode.TRACK, rng=np.random.default_rng(0)
     )
-    assert "no calibration target" in control.command(Event.CALIBRATE).reasons[1]
+    assert "no calibration target" in control.command(ModeEvent.CALIBRATE).reasons[1]
 
 
 def _searching(settings):
     rig = Rig(mode=Mode.TRACK, settings=settings)
     rig.run(5)
-    rig.control.command(Event.CALIBRATE, [0])
+    rig.control.command(ModeEvent.CALIBRATE, [0])
     rig.run(8)
-    rig.control.command(Event.SEARCH, [0])
+    rig.control.command(ModeEvent.SEARCH, [0])
     while rig.control.mode[0] != Mode.SEARCH:
         rig.run(0.5)
     return rig
@@ -324,10 +324,10 @@ def test_lost_feedback_points_and_back_tracks_unless_ordered():
     assert np.flatnonzero(rig.control.mode == Mode.POINT).tolist() == [2, 3]
     rig.run(1)
     assert rig.modes() == {"TRACK"}
-    rig.control.command(Event.POINT, [5])
+    rig.control.command(ModeEvent.POINT, [5])
     rig.run(10)
     assert np.flatnonzero(rig.control.mode == Mode.POINT).tolist() == [5]
-    rig.control.command(Event.TRACK, [5])
+    rig.control.command(ModeEvent.TRACK, [5])
     rig.run(10)
     assert rig.modes() == {"TRACK"}
 
@@ -346,7 +346,7 @@ def test_power_loss_keeps_the_counts_and_nothing_moves():
     rig.run(5)
     np.testing.assert_array_equal(rig.control.mode == Mode.IDLE, off)
     np.testing.assert_array_equal(rig.control.reported_mode == Mode.IDLE, off)
-    rig.control.command(Event.STOW, off)
+    rig.control.command(ModeEvent.STOW, off)
     rig.run(60)
     np.testing.assert_array_equal(rig.control.mode == Mode.STOW, off)
 
@@ -371,14 +371,14 @@ def test_without_counts_a_heliostat_waits_to_be_zeroed():
     rig.control.power_on([7], counts_kept=False)
     rig.run(6)
     assert rig.control.mode[7] == Mode.FAULT
-    assert "zero them first" in rig.control.command(Event.STOW, [7]).reasons[7]
+    assert "zero them first" in rig.control.command(ModeEvent.STOW, [7]).reasons[7]
     rig.control.emergency()
     at = rig.axis[7].copy()
     rig.run(60)
     np.testing.assert_allclose(rig.axis[7], at)
-    assert rig.control.command(Event.ZERO_COUNTS, [7]).accepted[7]
+    assert rig.control.command(ModeEvent.ZERO_COUNTS, [7]).accepted[7]
     rig.run(6)
-    assert rig.control.command(Event.STOW, [7]).accepted[7]
+    assert rig.control.command(ModeEvent.STOW, [7]).accepted[7]
     rig.run(60)
     assert rig.modes() == {"STOW"}
 
@@ -386,7 +386,7 @@ def test_without_counts_a_heliostat_waits_to_be_zeroed():
 def test_orders_are_repeated_until_everyone_has_them():
     rig = Rig(n=320, mode=Mode.TRACK, lost=0.4, settings=FieldSettings(watchdog_intervals=50.0))
     rig.run(2)
-    rig.control.command(Event.DEFOCUS)
+    rig.control.command(ModeEvent.DEFOCUS)
     rig.run(4)
     some = np.mean(rig.control.mode == Mode.DEFOCUS)
     assert 0.3 < some < 0.9
@@ -399,7 +399,7 @@ def test_a_repeated_order_is_obeyed_once():
     """The answer is lost, the centre repeats REFOCUS; the heliostat tracks by then and must not refuse it."""
     rig = Rig(n=320, mode=Mode.DEFOCUS, lost=0.4, settings=FieldSettings(watchdog_intervals=50.0))
     rig.run(2)
-    rig.control.command(Event.REFOCUS)
+    rig.control.command(ModeEvent.REFOCUS)
     refused = 0
     for _ in range(60):
         refused += int((rig.run(1, step_s=1.0).refused >= 0).sum())
@@ -455,7 +455,7 @@ def test_an_aim_out_of_reach_is_said_and_waited_for():
     rig = Rig()
     rig.aim_axis[6] = np.nan
     rig.run(2)
-    rig.control.command(Event.APPROACH)
+    rig.control.command(ModeEvent.APPROACH)
     orders = rig.run(60)
     assert np.flatnonzero(orders.unreachable).tolist() == [6]
     assert orders.mode[6] == Mode.APPROACH
@@ -470,7 +470,7 @@ def test_a_field_put_away_and_taken_up_goes_on_the_same():
     def first_half(rig):
         rig.run(20)
         rig.control.fail_cluster(1)
-        rig.control.command(Event.DEFOCUS, np.arange(0, 100, 7))
+        rig.control.command(ModeEvent.DEFOCUS, np.arange(0, 100, 7))
         rig.run(7, wind_mps=11.0)
 
     first_half(whole)
@@ -502,9 +502,9 @@ def _step(control, **changes):
         (lambda c: _step(c, wind_mps=-3.0), "`wind_mps` must not be negative"),
         (lambda c: _step(c, axis_rad=np.zeros((3, 2))), r"`axis_rad` must have shape \(40, 2\)"),
         (lambda c: _step(c, sun_enu=[np.nan, 0, 1]), "`sun_enu` must be finite"),
-        (lambda c: c.command(Event.ARRIVED), "`command` must be one of"),
-        (lambda c: c.command(Event.STOW, [40]), "`heliostats` must be indices below 40"),
-        (lambda c: c.command(Event.STOW, [True, False]), "`heliostats` must be a mask of 40"),
+        (lambda c: c.command(ModeEvent.ARRIVED), "`command` must be one of"),
+        (lambda c: c.command(ModeEvent.STOW, [40]), "`heliostats` must be indices below 40"),
+        (lambda c: c.command(ModeEvent.STOW, [True, False]), "`heliostats` must be a mask of 40"),
         (lambda c: c.fail_cluster(2), "`cluster` must be 0 … 1, got 2"),
         (lambda c: c.emergency("strong wind"), "which come and go by themselves"),
     ],
@@ -526,7 +526,7 @@ def test_wrong_calls_say_what_is_wrong(call, says):
 def test_wrong_fields_say_what_is_wrong(change, says):
     given = {"aim_enu_m": RECEIVER, "pivot_enu_m": np.zeros((2, 3)), "rng": np.random.default_rng(0), **change}
     with pytest.raises(InvalidInputError, match=says):
-        FieldControl(**given)
+        ControlledField(**given)
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from rfpose.feedback.fieldcontrol.modes import (
     REFUSED,
     TABLE,
     TRANSITIONS,
-    Event,
     Mode,
+    ModeEvent,
     dot,
     follow,
     refusal,
@@ -59,7 +59,7 @@ EXPECTED = {
     ("POWER_LOSS", "COUNTS_LOST"): "FAULT",
     ("FAULT", "ZERO_COUNTS"): "IDLE",
 }
-PAIRS = list(itertools.product(Mode, Event))
+PAIRS = list(itertools.product(Mode, ModeEvent))
 
 
 @pytest.mark.parametrize(("mode", "event"), PAIRS, ids=lambda item: item.name)
@@ -81,11 +81,11 @@ def test_every_pair_of_mode_and_event(mode, event):
 
 
 def test_reasons_name_the_remedy():
-    assert refusal(Mode.STOW, Event.TRACK) == "TRACK refused: it is stowed: order an approach first"
-    assert "stow it first" in refusal(Mode.IDLE, Event.TRACK)
-    assert "no power" in refusal(Mode.POWER_LOSS, Event.ZERO_COUNTS)
-    assert "order calibrate first" in refusal(Mode.TRACK, Event.SEARCH)
-    assert "zero them first" in refusal(Mode.FAULT, Event.STOW)
+    assert refusal(Mode.STOW, ModeEvent.TRACK) == "TRACK refused: it is stowed: order an approach first"
+    assert "stow it first" in refusal(Mode.IDLE, ModeEvent.TRACK)
+    assert "no power" in refusal(Mode.POWER_LOSS, ModeEvent.ZERO_COUNTS)
+    assert "order calibrate first" in refusal(Mode.TRACK, ModeEvent.SEARCH)
+    assert "zero them first" in refusal(Mode.FAULT, ModeEvent.STOW)
 
 
 def test_no_mode_is_a_trap():
@@ -97,12 +97,12 @@ def test_no_mode_is_a_trap():
 
 def test_every_powered_mode_with_valid_counts_can_be_stowed_at_once():
     for mode in set(Mode) - {Mode.POWER_LOSS, Mode.FAULT}:
-        assert TRANSITIONS[mode][Event.STOW] in (Mode.STOW, Mode.STOWING)
+        assert TRANSITIONS[mode][ModeEvent.STOW] in (Mode.STOW, Mode.STOWING)
 
 
 def test_without_messages_every_mode_ends_in_stow():
     """Silence, waiting and arriving alone lead from each moving mode to the park position."""
-    alone = {Event.HEARTBEAT_LOST, Event.HOLD_OVER, Event.ARRIVED}
+    alone = {ModeEvent.HEARTBEAT_LOST, ModeEvent.HOLD_OVER, ModeEvent.ARRIVED}
     for mode in set(Mode) - {Mode.POWER_LOSS, Mode.FAULT}:
         here = mode
         for _ in range(5):
@@ -135,5 +135,5 @@ def test_picture_shows_every_mode_and_arrow():
     for mode in Mode:
         assert mode.name.replace("_", " ") in texts
     words = "\n".join(texts)
-    for event in Event:
+    for event in ModeEvent:
         assert event.name.replace("_", " ").lower() in words.lower()

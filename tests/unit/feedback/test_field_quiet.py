@@ -8,8 +8,8 @@ import pytest
 
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings, MessageStatus
-from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings, Orders
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.control import ControlledField, FieldSettings, Orders
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.feedback.fieldcontrol.motion import move_axes
 
 EARTH_RAD_S = 2.0 * np.pi / 86400.0
@@ -72,7 +72,7 @@ class Twin:
     def __init__(self, world):
         n = world.n
         self.world = world
-        self.control = FieldControl(
+        self.control = ControlledField(
             aim_enu_m=[0.0, 0.0, 60.0],
             pivot_enu_m=np.stack([np.linspace(-90.0, 90.0, n), np.full(n, -80.0), np.full(n, 2.0)], axis=1),
             calibration_enu_m=[0.0, 0.0, 45.0],
@@ -109,7 +109,7 @@ class Twin:
         dark = control.mode == Mode.POWER_LOSS
         what = rng.choice(["command", "command", "command", "cluster", "centre", "power", "alarm", "well", "well"])
         if what == "command":
-            control.command(Event(rng.integers(0, Event.ZERO_COUNTS + 1)), some)
+            control.command(ModeEvent(rng.integers(0, ModeEvent.ZERO_COUNTS + 1)), some)
         elif what == "cluster":
             (control.fail_cluster if rng.random() < 0.4 else control.repair_cluster)(0)
         elif what == "centre":
@@ -128,8 +128,8 @@ class Twin:
             for cluster in np.unique(control.cluster):
                 control.repair_cluster(int(cluster))
             control.power_on(dark)
-            control.command(Event.APPROACH)
-            control.command(Event.REFOCUS)
+            control.command(ModeEvent.APPROACH)
+            control.command(ModeEvent.REFOCUS)
 
 
 def differing(one, other):
@@ -162,7 +162,7 @@ def test_one_step_over_a_quiet_time_equals_a_step_each_second(seed):
 
 
 def _calm(n=40, *, mode=Mode.TRACK, settings=None, **bus):
-    control = FieldControl(
+    control = ControlledField(
         aim_enu_m=[0.0, 0.0, 60.0],
         pivot_enu_m=np.stack([np.arange(n), np.full(n, -80.0), np.zeros(n)], axis=1),
         mode=mode,
@@ -268,7 +268,7 @@ def test_an_order_that_cannot_arrive_does_not_keep_the_field_awake():
     control.power_off([40])
     control.step(0.0, **inputs)
     control.step(1.0, **inputs)
-    reply = control.command(Event.APPROACH, [3, 40, 50])  # the centre does not know what was heard last
+    reply = control.command(ModeEvent.APPROACH, [3, 40, 50])  # the centre does not know what was heard last
     assert reply.accepted.sum() == 3
     assert control.quiet_until(4.0) == 4.0  # the third waits for the next round
     control.step(4.0, **inputs)
@@ -277,7 +277,7 @@ def test_an_order_that_cannot_arrive_does_not_keep_the_field_awake():
         control.step(second, **inputs)
     assert np.flatnonzero(control.mode == Mode.TRACK).tolist() == [50]
     assert np.flatnonzero(control.waiting).tolist() == [3, 40]
-    control.command(Event.STOW, [50])
+    control.command(ModeEvent.STOW, [50])
     for second in np.arange(8.0, 28.0):  # longer than the watchdog waits: to stowed heliostats silence does nothing
         control.step(second, **(inputs | {"axis_rad": np.zeros((64, 2))}))
     for now, until in ((27.5, 28.0), (28.0, 32.0)):
@@ -316,12 +316,12 @@ def test_messages_are_counted_by_what_became_of_them():
 def test_orders_are_counted_once_and_refusals_by_heliostats_too():
     control, inputs = _calm(n=12)
     control.step(0.0, **inputs)
-    control.command(Event.POINT, [0, 1, 2])
-    control.command(Event.POINT, [2, 3])  # on its way to one of them already
+    control.command(ModeEvent.POINT, [0, 1, 2])
+    control.command(ModeEvent.POINT, [2, 3])  # on its way to one of them already
     assert control.messages.orders_sent == 4
     control.power_off([0])
     control.power_on([0])  # IDLE, which the centre does not know
-    assert control.command(Event.HOLD, [0]).reasons
+    assert control.command(ModeEvent.HOLD, [0]).reasons
     for second in range(1, 12):
         control.step(float(second), **inputs)
     got = control.messages

@@ -7,7 +7,7 @@ import pytest
 
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.feedback import optics
-from rfpose.feedback.tracking.live import LiveField, Moment, live_scenario
+from rfpose.feedback.tracking.live import FieldMoment, LiveField, live_scenario
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.scenario import Scenario, load_scenario
 
@@ -18,7 +18,7 @@ def scenario() -> Scenario:
     return live_scenario(Scenario.model_validate(data))
 
 
-def after(field: LiveField, seconds: float) -> Moment:
+def after(field: LiveField, seconds: float) -> FieldMoment:
     for _ in range(round(seconds / field.step_s)):
         moment = field.step()
     return moment
@@ -31,7 +31,7 @@ def field() -> LiveField:
     return found
 
 
-def miss_rad(field: LiveField, moment: Moment) -> np.ndarray:
+def miss_rad(field: LiveField, moment: FieldMoment) -> np.ndarray:
     """Angle of each beam from the line to its aim point."""
     beam = optics.reflect(moment.normal_enu, moment.sun_enu)
     way = field.field.target[:, :3] - field.field.pivot_enu_m

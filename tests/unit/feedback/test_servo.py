@@ -17,7 +17,7 @@ from rfpose.feedback.servo import (
     servo_step,
 )
 from rfpose.feedback.servo.rules import EARTH_RADPS
-from rfpose.feedback.structure import EDWARDS_MODE, Structure, deflect, plate_mode_hz
+from rfpose.feedback.structure import EDWARDS_MODE, StructureMode, deflect, plate_mode_hz
 
 LINEAR = PiLaw(levels=0, range_rad=1.0, speed_radps=10.0)
 STEP = Stepper().step_rad
@@ -201,7 +201,7 @@ def test_a_field_is_its_axes_one_by_one():
         (lambda: Stepper(backlash_rad=-1.0), "backlash_rad"),
         (lambda: Stepper(dead_band_rad=1e-4, lead_rad=2e-4), "hunt"),
         (lambda: Stepper(speed_radps=1e-6).numbers(1.0), "one step"),
-        (lambda: Structure(damping=1.2), "damping"),
+        (lambda: StructureMode(damping=1.2), "damping"),
         (lambda: margins(PiLaw(), None, latency_s=-1.0), "latency_s"),
         (lambda: follow(rest(), lambda i: np.zeros((3, 2))), "command_rad"),
     ],
@@ -212,7 +212,7 @@ def test_bad_settings_are_named(make, word):
 
 
 def test_structure_answers_as_its_frequency_response():
-    mode = Structure(natural_hz=0.1, damping=0.1)
+    mode = StructureMode(natural_hz=0.1, damping=0.1)
     for frequency in (0.02, 0.1, 0.2):
         load = np.sin(2.0 * np.pi * frequency * 0.25 * np.arange(8000))
         out = deflect(load, mode, interval_s=0.25)

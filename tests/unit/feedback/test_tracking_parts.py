@@ -11,7 +11,7 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.feedback.energy import dish_capture_at, dish_efficiency
 from rfpose.feedback.mount import PARAMETERS
 from rfpose.feedback.optics import intercept_ratio
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import StructureMode
 from rfpose.feedback.tracking import METHODS, _kernels
 from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD, capture_table
 from rfpose.feedback.tracking.hidden import draw_field, field_positions
@@ -25,7 +25,7 @@ from rfpose.feedback.tracking.wind import Gusts
 from rfpose.feedback.wind.spectrum import wind_deflection
 from rfpose.layout.maps import ESTIMATORS, mirrors_facing, normal_map
 from rfpose.measurement import Estimator, noise_of
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, rigid_bound
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, rigid_bound
 from rfpose.scenario import load_scenario, parse_scenario
 from rfpose.sun import sun_position
 
@@ -231,7 +231,7 @@ def test_radio_noise_lies_as_the_pose_has_it():
     mirrors = MirrorProblem.expected(
         scenario.transmitter_enu_m, places, scenario.pivot_enu_m, rot,
         sigma_m=np.broadcast_to(sigma, (12, 3, 3, 10)), transmitter_sigma_m=common, clock_class=[0, 1, 2],
-        knowledge=Knowledge(clock_sigma_m=0.0, pivot_enu_m=scenario.pivot_enu_m, pivot_sigma_m=5e-3),
+        knowledge=MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=scenario.pivot_enu_m, pivot_sigma_m=5e-3),
     )  # fmt: skip
     cov = rigid_bound(mirrors)[:, 3:, 3:]
     for m in range(12):
@@ -374,7 +374,7 @@ def test_a_heard_sun_is_carried_on_as_the_sky_turns():
 
 def test_the_kernels_swing_has_the_winds_variance_and_rings_down():
     gusts = Gusts(changed(structure={"natural_hz": 2.2, "damping": 0.02}, wind={"mean_speed_mps": 7.0}))
-    mode = Structure(natural_hz=2.2, damping=0.02)
+    mode = StructureMode(natural_hz=2.2, damping=0.02)
     want = [float(wind_deflection(b, 7.0, mode, size_m=2.0)[1]) for b in gusts.bend]
     np.testing.assert_allclose(gusts.swing_sigma_rad**2, want, rtol=1e-12)
     loop = _kernels.Loop(**dict.fromkeys(_kernels.Loop._fields, 0))._replace(servo_s=1.0, **_swing(gusts))

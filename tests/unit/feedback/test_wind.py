@@ -3,7 +3,7 @@ import pytest
 from scipy import signal
 
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.structure import Structure, swing_transition
+from rfpose.feedback.structure import StructureMode, swing_transition
 from rfpose.feedback.wind import (
     WindLoad,
     admittance,
@@ -51,7 +51,7 @@ def test_same_seed_same_gusts_and_pieces_continue():
 
 
 def test_background_and_resonance_add_up_to_what_a_record_does():
-    mode = Structure(natural_hz=0.25, damping=0.1)
+    mode = StructureMode(natural_hz=0.25, damping=0.1)
     process = gust_process(5.0, interval_s=0.25, size_m=3.0)
     rng = np.random.default_rng(2)
     gust = process.run(process.start(rng, 60), rng, 16_384)
@@ -66,7 +66,7 @@ def test_background_and_resonance_add_up_to_what_a_record_does():
 
 @pytest.mark.parametrize(("hz", "damping", "interval"), [(2.2, 0.02, 1.0), (0.6, 0.1, 1.0), (5.0, 0.3, 0.25)])
 def test_a_swing_is_that_of_the_mode_between_samples(hz, damping, interval):
-    mode = Structure(natural_hz=hz, damping=damping)
+    mode = StructureMode(natural_hz=hz, damping=damping)
     transition, root = swing_transition(mode, interval_s=interval)
     w = mode.natural_radps
     # stays as it is: deflection of variance one, speed of ω²
@@ -92,7 +92,7 @@ def test_a_swing_is_that_of_the_mode_between_samples(hz, damping, interval):
 
 
 def test_a_servo_takes_what_is_below_its_bandwidth():
-    mode = Structure(natural_hz=1.0, damping=0.03)
+    mode = StructureMode(natural_hz=1.0, damping=0.03)
     all_of_it, resonant = wind_deflection(1e-4, [5.0], mode, size_m=4.0)
     left, same = wind_deflection(1e-4, [5.0], mode, size_m=4.0, residual=perfect_servo(0.1))
     assert left[0] < 0.15 * all_of_it[0]

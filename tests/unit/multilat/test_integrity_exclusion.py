@@ -10,7 +10,7 @@ from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus, solve_with_integrity
 from rfpose.multilat.integrity.hypotheses import judge, log_probability, noncentrality
-from rfpose.multilat.rigid import Knowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -41,16 +41,16 @@ def settings(known=None, calibration=SIGMA, n_group=1):
         "clock_class": [0] * n_group,
         "start_pivot_enu_m": PIVOT + 0.2,
         "start_rot_enu_from_mirror": ROT,
-        "knowledge": known or Knowledge(clock_sigma_m=0.0),
+        "knowledge": known or MirrorKnowledge(clock_sigma_m=0.0),
     }
 
 
 KNOWN = {
-    "one clock, calibrated": (Knowledge(clock_sigma_m=0.0), 1.5 * SIGMA),
-    "three clocks, calibrated": (Knowledge(), 0.5 * SIGMA),
-    "between receivers": (Knowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3), np.inf),
+    "one clock, calibrated": (MirrorKnowledge(clock_sigma_m=0.0), 1.5 * SIGMA),
+    "three clocks, calibrated": (MirrorKnowledge(), 0.5 * SIGMA),
+    "between receivers": (MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3), np.inf),
     "everything": (
-        Knowledge(clock_sigma_m=2e-3, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3, two_axis=True, roll_sigma_rad=1e-3),
+        MirrorKnowledge(clock_sigma_m=2e-3, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3, two_axis=True, roll_sigma_rad=1e-3),
         SIGMA,
     ),
 }
@@ -195,7 +195,7 @@ def test_a_transmitters_own_error_is_harmless_between_receivers():
 def test_a_pivot_that_is_off_is_rejected_not_averaged(off_m):
     survey = PIVOT.copy()
     survey[1, 0] += off_m
-    known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=survey, pivot_sigma_m=5e-3)
+    known = MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=survey, pivot_sigma_m=5e-3)
     z = measure(7)
     found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known)))
     assert found.status[1] == IntegrityStatus.PRIOR_REJECTED
@@ -212,13 +212,13 @@ def test_a_wrong_mount_or_clock_is_rejected(prior):
     z = measure(8)
     if prior == "clocks":
         z[2, 0, 1] += 0.3  # a nanosecond of cable
-        known = Knowledge(clock_sigma_m=0.0)
+        known = MirrorKnowledge(clock_sigma_m=0.0)
     else:
         tilted = ROT[2] @ np.array([[np.cos(0.1), -np.sin(0.1), 0], [np.sin(0.1), np.cos(0.1), 0], [0, 0, 1]])
         receiver = PIVOT[2] + PLACES @ tilted.T
         z[2, 0] += np.linalg.norm(receiver[:, None] - TRANSMITTER, axis=-1)
         z[2, 0] -= np.linalg.norm((PIVOT[2] + PLACES @ ROT[2].T)[:, None] - TRANSMITTER, axis=-1)
-        known = Knowledge(clock_sigma_m=0.0, two_axis=True)
+        known = MirrorKnowledge(clock_sigma_m=0.0, two_axis=True)
     found = solve_with_integrity(MirrorProblem.of(TRANSMITTER, PLACES, z, **settings(known)))
     which = ("pivot", "mount", "clocks").index(prior)
     np.testing.assert_array_equal(np.argwhere(found.prior_rejected), [[2, which]])
@@ -301,7 +301,7 @@ def test_a_receiver_that_hears_nothing_brings_no_clock():
     z = measure(14, n_group=2)
     z[:, :, 2] = np.nan
     mirrors = MirrorProblem.of(
-        TRANSMITTER, PLACES, z, **settings(Knowledge(pivot_enu_m=PIVOT, pivot_sigma_m=5e-3), n_group=2)
+        TRANSMITTER, PLACES, z, **settings(MirrorKnowledge(pivot_enu_m=PIVOT, pivot_sigma_m=5e-3), n_group=2)
     )
     poses = solve_rigid(mirrors)
     # two receivers' ranges by ten transmitters in two wavelengths and a pivot, less pose and two clocks

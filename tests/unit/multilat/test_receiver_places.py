@@ -5,7 +5,7 @@ import pytest
 
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror
-from rfpose.multilat.rigid import Knowledge, MirrorProblem
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem
 from rfpose.multilat.rigid.places import places_bound, refine_places
 
 RNG = np.random.default_rng(9)
@@ -82,7 +82,7 @@ def test_without_calibration_distances_between_receivers_are_seen():
     for _ in range(40):
         true = DRAWN + 5e-4 * rng.standard_normal(DRAWN.shape)
         z, rot = measure(rng, true, calibration=np.inf, clocks=1)
-        known = Knowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3)
+        known = MirrorKnowledge(clock_sigma_m=0.0, pivot_enu_m=PIVOT, pivot_sigma_m=5e-3)
         found = refine(z, rot, calibration=np.inf, knowledge=known)
         distance, slope = apart(found.receiver_mirror_m)
         cov = slope @ found.cov_m2 @ slope.T
@@ -105,7 +105,7 @@ def test_what_nothing_shows_is_named():
     free = refine(z, rot, common_pivot=False)
     assert free.rank == 6
     assert sum("shift" in name for name in free.unseen_names) == 3
-    mount = refine(z, rot, knowledge=Knowledge(two_axis=True))
+    mount = refine(z, rot, knowledge=MirrorKnowledge(two_axis=True))
     assert mount.rank == 11
     assert mount.unseen_names[0].startswith("rotation of all receivers against the glass about (1.00, 0.00")
 

@@ -7,12 +7,12 @@ from scipy.stats import chi2
 
 from rfpose import geometry
 from rfpose.multilat.site import (
-    Constants,
     PostureCorrelation,
     ReferencePoses,
     SiteKnowledge,
     SiteObservations,
     SiteSettings,
+    SurveyConstants,
     SurveyPrior,
     Voltages,
     lever_to_turn,
@@ -74,11 +74,11 @@ class Site:
     def __init__(self, seed, prior=PRIOR, n_frame=N_FRAME):
         rng = np.random.default_rng(seed)
         self.prior = prior
-        self.given = Constants(
+        self.given = SurveyConstants(
             receiver_mirror_m=np.tile(PLACES, (len(PIVOTS), 1, 1)), pivot_enu_m=PIVOTS,
             transmitter_enu_m=TRANSMITTERS, delay_m=np.zeros((len(PIVOTS), 3)),
         )  # fmt: skip
-        self.true = Constants(
+        self.true = SurveyConstants(
             receiver_mirror_m=PLACES + prior.place_sigma_m * rng.standard_normal((len(PIVOTS), 3, 3)),
             pivot_enu_m=PIVOTS + prior.pivot_sigma_m * rng.standard_normal(PIVOTS.shape),
             transmitter_enu_m=TRANSMITTERS + prior.transmitter_sigma_m[:, None] * rng.standard_normal((10, 3)),

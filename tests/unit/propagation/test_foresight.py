@@ -18,8 +18,8 @@ from rfpose.propagation import (
     PlatesStanding,
     RayKind,
     Rays,
+    ReceiverStand,
     Soil,
-    Stand,
     Surroundings,
     bystanders,
     foresee,
@@ -53,7 +53,7 @@ def rays_to(places, transmitter, surroundings, options=ALL) -> Rays:
     return foresee([transmitter], [CARRIER_HZ], bystanders(np.atleast_2d(places)), surroundings, options)
 
 
-def ways_m(rays: Rays, stand: Stand, n_transmitter: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def ways_m(rays: Rays, stand: ReceiverStand, n_transmitter: int = 1) -> tuple[np.ndarray, np.ndarray]:
     link = np.repeat(np.arange(len(rays.first) - 1), np.diff(rays.first))
     mirror = link // (stand.receiver_mirror_m.shape[1] * n_transmitter)
     place = stand.pivot_enu_m[mirror] + np.einsum("kab,kb->ka", stand.rot_enu_from_mirror[mirror], rays.place_mirror_m)
@@ -190,7 +190,7 @@ def test_a_ground_ray_needs_both_its_legs():
 
 def test_a_mirrors_own_plate_hides_and_a_flush_receiver_looks_out_of_its_front():
     own = plates(([0.0, 0.0, 5.0], [0.0, 0.0, 1.0], [2.0, 2.0]))
-    stand = Stand(
+    stand = ReceiverStand(
         pivot_enu_m=np.array([[0.0, 0.0, 5.0]]),
         rot_enu_from_mirror=own.rot_enu_from_mirror,
         receiver_mirror_m=np.array([[[0.5, 0.0, 0.1], [0.5, 0.0, 0.0], [0.5, 0.0, -0.1], [1.2, 0.0, -0.1]]]),
@@ -352,7 +352,7 @@ def test_rays_of_the_own_plate_turn_with_the_mirror():
         own = PlatesStanding(
             centre_enu_m=pivot + arm * rot[:, :, 2], rot_enu_from_mirror=rot, size_m=np.array([[2.0, 2.0]])
         )
-        stand = Stand(
+        stand = ReceiverStand(
             pivot_enu_m=pivot,
             rot_enu_from_mirror=rot,
             receiver_mirror_m=np.add(place, [0.0, 0.0, arm]),
@@ -397,7 +397,9 @@ def crowd(n_mirror=7):
     place = np.broadcast_to([[1.7, 1.0, 0.05], [-1.7, 1.0, 0.05], [0.0, -1.7, 0.05]], (n_mirror, 3, 3)).copy()
     place[2, 1] = np.nan
     rot = rot.copy()
-    stand = Stand(pivot_enu_m=pivot, rot_enu_from_mirror=rot, receiver_mirror_m=place, own_plate=np.arange(n_mirror))
+    stand = ReceiverStand(
+        pivot_enu_m=pivot, rot_enu_from_mirror=rot, receiver_mirror_m=place, own_plate=np.arange(n_mirror)
+    )
     rot[4] = np.nan
     things = Surroundings(plates=own, boxes=boxes([30.0, 0.0, 0.0], [5.0, 5.0, 30.0]), soil=Soil(permittivity=15.0))
     transmitter = np.array([[60.0, 10.0, 20.0], [-50.0, 30.0, 25.0], [0.0, -60.0, 30.0]])

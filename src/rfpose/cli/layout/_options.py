@@ -16,7 +16,7 @@ from rfpose.cli._support import gathered
 if TYPE_CHECKING:
     from rfpose.pipeline.layout.site import Postures
 
-__all__ = ["CRITERIA", "ESTIMATORS", "Studied", "field_options"]
+__all__ = ["CRITERIA", "ESTIMATORS", "StudiedHeliostats", "field_options"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -26,7 +26,7 @@ CRITERIA = ("pdop", "independent", "rigid", "shared-clock", "site")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Studied:
+class StudiedHeliostats:
     """Which heliostats a study is about, and in which postures, as its options say."""
 
     field: Path | None
@@ -52,7 +52,7 @@ class Studied:
 
 def field_options(function: F) -> F:
     """Add ``--field``, ``--sun``, ``--day``, ``--year`` and ``--stow``; the command gets them as ``studied``."""
-    function = gathered("studied", Studied)(function)
+    function = gathered("studied", StudiedHeliostats)(function)
     options = (
         click.option("--stow", is_flag=True, help="Also the stow posture, face up."),
         click.option(

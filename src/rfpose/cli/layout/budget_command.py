@@ -22,7 +22,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import Studied, field_options
+from rfpose.cli.layout._options import StudiedHeliostats, field_options
 
 __all__ = ["command"]
 
@@ -68,7 +68,7 @@ def command(
     seed: int,
     output: Path | None,
     picture: Path | None,
-    studied: Studied,
+    studied: StudiedHeliostats,
     force: bool,
 ) -> None:
     """Say where the error of the normals comes from, worst first, and what would reduce it.

@@ -19,7 +19,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import ESTIMATORS, Studied, field_options
+from rfpose.cli.layout._options import ESTIMATORS, StudiedHeliostats, field_options
 
 __all__ = ["command"]
 
@@ -47,7 +47,7 @@ def command(
     cost: tuple[float, float, float],
     picture: Path | None,
     csv_path: Path | None,
-    studied: Studied,
+    studied: StudiedHeliostats,
     force: bool,
 ) -> None:
     """Compare layouts: what their normals can be known to, in the same postures, and what they cost."""

@@ -22,7 +22,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import ESTIMATORS, Studied, field_options
+from rfpose.cli.layout._options import ESTIMATORS, StudiedHeliostats, field_options
 from rfpose.shown import counted
 
 __all__ = ["command"]
@@ -63,7 +63,7 @@ def command(
     sensitivity: bool,
     picture: Path | None,
     csv_path: Path | None,
-    studied: Studied,
+    studied: StudiedHeliostats,
     force: bool,
 ) -> None:
     """Say what each mirror's normal can be known to, and what the loss of each transmitter costs."""

@@ -24,7 +24,7 @@ from rfpose.cli._support import (
     table,
     wants_json,
 )
-from rfpose.cli.layout._options import CRITERIA, Studied, field_options
+from rfpose.cli.layout._options import CRITERIA, StudiedHeliostats, field_options
 
 if TYPE_CHECKING:
     from rfpose.pipeline.layout import SitePlacement, SitePlacements
@@ -150,7 +150,7 @@ def command(
     files: _Files,
     search: _Search,
     where: _Where,
-    studied: Studied,
+    studied: StudiedHeliostats,
     force: bool,
 ) -> None:
     """Place the transmitters anew, for the best accuracy that the limits allow."""

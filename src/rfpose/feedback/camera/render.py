@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import InvalidInputError
 
-__all__ = ["Beam", "CameraView", "Disturbance", "Target", "project_px", "render"]
+__all__ = ["Beam", "CameraView", "PictureFlaws", "Target", "project_px", "render"]
 
 Image = npt.NDArray[np.uint8]
 
@@ -136,7 +136,7 @@ class Beam:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbance:
+class PictureFlaws:
     """What makes a picture worse.
 
     Attributes
@@ -177,7 +177,7 @@ def render(
     view: CameraView,
     beams: Beam | tuple[Beam, ...] = (),
     *,
-    disturbance: Disturbance | None = None,
+    disturbance: PictureFlaws | None = None,
     rng: np.random.Generator | None = None,
 ) -> Image:
     """Return a picture, eight bits a pixel.
@@ -198,7 +198,7 @@ def render(
     (row, column)
         Values beyond full scale are clipped, as a sensor does.
     """
-    worse = disturbance or Disturbance()
+    worse = disturbance or PictureFlaws()
     x, y = _plane(view)
     light = _surface(target, x, y, worse.side_light)
     for beam in (beams,) if isinstance(beams, Beam) else beams:

@@ -1,6 +1,6 @@
 """Field control: messages, buses, modes and emergencies of up to ten thousand heliostats.
 
-`control.FieldControl` is what a simulation steps. Each servo step::
+`control.ControlledField` is what a simulation steps. Each servo step::
 
     control = FieldControl(aim_enu_m=aim, pivot_enu_m=pivot, mode=Mode.TRACK, rng=rng)
     control.command(Event.DEFOCUS, [3, 7])               # any time; answers who is refused, and why

@@ -14,15 +14,15 @@ from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.fieldcontrol.bus import BusSettings, MessageStatus
 from rfpose.feedback.fieldcontrol.local import NOTHING, Heliostats
-from rfpose.feedback.fieldcontrol.modes import COMMANDS, Event, Mode, refusal
+from rfpose.feedback.fieldcontrol.modes import COMMANDS, Mode, ModeEvent, refusal
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, Messages, ModeArray, Orders, Reply
 from rfpose.feedback.fieldcontrol.wire import Wire
 from rfpose.feedback.servo.rules import EARTH_RADPS
 
-__all__ = ["FieldControl", "FieldSettings", "Messages", "Orders", "Reply"]
+__all__ = ["ControlledField", "FieldSettings", "Messages", "Orders", "Reply"]
 
-_SAFETY = {Event.EMERGENCY: 3, Event.STOW: 2, Event.DEFOCUS: 1}
-_ALLOWED_IN_ALARM = frozenset({Event.STOW, Event.EMERGENCY, Event.ZERO_COUNTS})
+_SAFETY = {ModeEvent.EMERGENCY: 3, ModeEvent.STOW: 2, ModeEvent.DEFOCUS: 1}
+_ALLOWED_IN_ALARM = frozenset({ModeEvent.STOW, ModeEvent.EMERGENCY, ModeEvent.ZERO_COUNTS})
 _WIND, _WIND_UNKNOWN, _NIGHT = "strong wind", "wind unknown", "sun below the horizon"
 _CENTRE_SILENT = "centre silent"
 _BY_ITSELF = frozenset({_WIND, _WIND_UNKNOWN, _NIGHT, _CENTRE_SILENT})
@@ -30,7 +30,7 @@ _SUN_MARGIN_RAD = 1e-4
 _COUNTED = tuple(f"{what}_{status.name.lower()}" for what in ("sun", "question", "answer") for status in MessageStatus)
 
 
-class FieldControl:
+class ControlledField:
     """The three tiers of a field: the centre's orders, the clusters' buses and the heliostats' modes.
 
     Parameters
@@ -105,7 +105,7 @@ class FieldControl:
 
     # what the centre orders
 
-    def command(self, command: Event, heliostats: npt.ArrayLike | None = None) -> Reply:
+    def command(self, command: ModeEvent, heliostats: npt.ArrayLike | None = None) -> Reply:
         """Order something; it is on its way from now on and repeated until acknowledged.
 
         Parameters
@@ -132,7 +132,7 @@ class FieldControl:
             return Reply(accepted=accepted, reasons=dict.fromkeys(index.tolist(), why_all))
         by_mode = [refusal(mode, command) for mode in Mode]
         room = self.settings.calibration_places - int(self._at_calibration().sum())
-        new_there = (command == Event.CALIBRATE) & ~self._at_calibration()
+        new_there = (command == ModeEvent.CALIBRATE) & ~self._at_calibration()
         for i in index.tolist():
             why = by_mode[self._wire.reported_mode[i]] or self._contradicts(command, i)
             if why is None and new_there[i]:
@@ -142,7 +142,7 @@ class FieldControl:
                 accepted[i] = True
             else:
                 reasons[i] = why
-        self._wire.send(command, accepted, self._time_s, urgent=command == Event.EMERGENCY)
+        self._wire.send(command, accepted, self._time_s, urgent=command == ModeEvent.EMERGENCY)
         return Reply(accepted=accepted, reasons=reasons)
 
     def emergency(self, why: str = "emergency") -> None:
@@ -150,7 +150,7 @@ class FieldControl:
         self._check_centre()
         if why in _BY_ITSELF:
             raise InvalidInputError(f"`why` must not be one of {sorted(_BY_ITSELF)}, which come and go by themselves")
-        self._raise_alarm(why, Event.EMERGENCY)
+        self._raise_alarm(why, ModeEvent.EMERGENCY)
 
     def release(self) -> None:
         """End every alarm that was raised by hand; heliostats stay as they are until ordered."""
@@ -187,7 +187,7 @@ class FieldControl:
             now = as_float_array("axis_rad", axis_rad, (self.n_heliostat, 2), finite=False)
             self._heliostats.axis_rad[index] = now[index]
         self._heliostats.stored_rad[index] = self._heliostats.axis_rad[index]
-        self._heliostats.apply(index, Event.POWER_OFF, self._time_s)
+        self._heliostats.apply(index, ModeEvent.POWER_OFF, self._time_s)
         self._wire.silence(index)
 
     def power_on(self, heliostats: npt.ArrayLike | None = None, *, counts_kept: bool = True) -> None:
@@ -198,8 +198,8 @@ class FieldControl:
         if not counts_kept:
             stored[index] = np.nan
         good = np.isfinite(stored[index]).all(axis=1)
-        self._heliostats.apply(index[good], Event.POWER_ON, self._time_s)
-        self._heliostats.apply(index[~good], Event.COUNTS_LOST, self._time_s)
+        self._heliostats.apply(index[good], ModeEvent.POWER_ON, self._time_s)
+        self._heliostats.apply(index[~good], ModeEvent.COUNTS_LOST, self._time_s)
 
     # what is known
 
@@ -308,7 +308,7 @@ class FieldControl:
             self._watch_wind(wind_mps)
             self._watch_sun(sun)
         elif self._time_s - self._centre_lost_s >= self.settings.centre_silence_s:
-            self._raise_alarm(_CENTRE_SILENT, Event.EMERGENCY)
+            self._raise_alarm(_CENTRE_SILENT, ModeEvent.EMERGENCY)
         self._wire.communicate(self._time_s, sun)
         self._heliostats.watchdog(self._time_s, self._wire.watchdog_s)
         self._heliostats.notice(self._time_s, aim_axis, feedback, seen)
@@ -451,31 +451,31 @@ class FieldControl:
                 f"the centre is dead since {self._centre_lost_s:g} s and orders nothing; repair_centre() first"
             )
 
-    def _centre_refuses(self, command: Event) -> str | None:
+    def _centre_refuses(self, command: ModeEvent) -> str | None:
         if self._centre_lost_s is not None:
             return f"{command.name} refused: the centre is dead since {self._centre_lost_s:g} s"
         if self._alarms and command not in _ALLOWED_IN_ALARM:
             name, since = next(iter(self._alarms.items()))
             return f"{command.name} refused: {name} since {since:g} s; only stow is possible"
-        if command in (Event.CALIBRATE, Event.SEARCH) and not self._has_calibration:
+        if command in (ModeEvent.CALIBRATE, ModeEvent.SEARCH) and not self._has_calibration:
             return f"{command.name} refused: the field has no calibration target"
         return None
 
-    def _contradicts(self, command: Event, i: int) -> str | None:
+    def _contradicts(self, command: ModeEvent, i: int) -> str | None:
         other = int(self._wire.pending[i])
-        if other in (NOTHING, command) or _SAFETY.get(command, 0) > _SAFETY.get(Event(other), 0):
+        if other in (NOTHING, command) or _SAFETY.get(command, 0) > _SAFETY.get(ModeEvent(other), 0):
             return None
-        return f"{command.name} refused: contradicts {Event(other).name}, which is on its way"
+        return f"{command.name} refused: contradicts {ModeEvent(other).name}, which is on its way"
 
     def _at_calibration(self) -> BoolArray:
         """Whether heliostats are on the calibration target or sent there."""
         there = np.isin(self._wire.reported_mode, (Mode.CALIBRATE, Mode.SEARCH))
-        return np.asarray(there | (self._wire.pending == Event.CALIBRATE))
+        return np.asarray(there | (self._wire.pending == ModeEvent.CALIBRATE))
 
-    def _raise_alarm(self, name: str, command: Event) -> None:
+    def _raise_alarm(self, name: str, command: ModeEvent) -> None:
         if name not in self._alarms:
             self._alarms[name] = self._time_s
-            weaker = [_SAFETY.get(Event(p), 0) < _SAFETY[command] if p != NOTHING else True for p in range(-1, 11)]
+            weaker = [_SAFETY.get(ModeEvent(p), 0) < _SAFETY[command] if p != NOTHING else True for p in range(-1, 11)]
             to = np.array(weaker)[self._wire.pending + 1]
             self._wire.send(command, to, self._time_s, urgent=True, from_centre=self._centre_lost_s is None)
 
@@ -485,17 +485,17 @@ class FieldControl:
             self._wind_known_s = now
             self._alarms.pop(_WIND_UNKNOWN, None)
         elif now - self._wind_known_s >= settings.wind_gap_s:
-            self._raise_alarm(_WIND_UNKNOWN, Event.STOW)
+            self._raise_alarm(_WIND_UNKNOWN, ModeEvent.STOW)
         if not wind_mps < settings.wind_release_mps:
             self._wind_calm_s = now
         if wind_mps >= settings.wind_stow_mps:
-            self._raise_alarm(_WIND, Event.STOW)
+            self._raise_alarm(_WIND, ModeEvent.STOW)
         elif now - self._wind_calm_s >= settings.wind_release_s:
             self._alarms.pop(_WIND, None)
 
     def _watch_sun(self, sun_enu: FloatArray) -> None:
         if sun_enu[2] < self._lowest_sine * math.sqrt(sun_enu @ sun_enu):
-            self._raise_alarm(_NIGHT, Event.STOW)
+            self._raise_alarm(_NIGHT, ModeEvent.STOW)
         else:
             self._alarms.pop(_NIGHT, None)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.feedback.fieldcontrol.modes import COMMANDS, TRANSITIONS, Event, Mode
+from rfpose.feedback.fieldcontrol.modes import COMMANDS, TRANSITIONS, Mode, ModeEvent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,7 @@ _PLACE: dict[Mode, tuple[float, float]] = {
 }
 _COLOUR = {"command": "#0072B2", "itself": "#D55E00"}
 # These happen in most modes and would hide the rest; they are told in words below the picture.
-_COMMON = (Event.EMERGENCY, Event.HEARTBEAT_LOST, Event.STOW, Event.HOLD, Event.POWER_OFF)
+_COMMON = (ModeEvent.EMERGENCY, ModeEvent.HEARTBEAT_LOST, ModeEvent.STOW, ModeEvent.HOLD, ModeEvent.POWER_OFF)
 _HALF = np.array([0.95, 0.34])
 
 
@@ -65,9 +65,9 @@ def draw_modes() -> Figure:
     return figure
 
 
-def _arrows() -> dict[tuple[Mode, Mode], list[Event]]:
+def _arrows() -> dict[tuple[Mode, Mode], list[ModeEvent]]:
     """Events of each arrow that is drawn; staying in a mode is not."""
-    arrows: dict[tuple[Mode, Mode], list[Event]] = {}
+    arrows: dict[tuple[Mode, Mode], list[ModeEvent]] = {}
     for before, row in TRANSITIONS.items():
         for event, after in row.items():
             if before != after and not (event in _COMMON and len(_from(event)) > 3):
@@ -75,7 +75,7 @@ def _arrows() -> dict[tuple[Mode, Mode], list[Event]]:
     return arrows
 
 
-def _from(event: Event) -> list[Mode]:
+def _from(event: ModeEvent) -> list[Mode]:
     """Modes that an event leaves."""
     return [mode for mode, row in TRANSITIONS.items() if event in row and row[event] != mode]
 
@@ -94,7 +94,7 @@ def _in_words() -> str:
     return "\n".join(lines)
 
 
-def _draw_arrow(axes: Axes, before: Mode, after: Mode, events: list[Event]) -> None:
+def _draw_arrow(axes: Axes, before: Mode, after: Mode, events: list[ModeEvent]) -> None:
     """Draw one arrow, to the left of its way so that there and back lie apart, with its events beside it."""
     start, end = np.array(_PLACE[before]), np.array(_PLACE[after])
     way = end - start

@@ -18,12 +18,12 @@ from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.feedback import _kernels, optics
 from rfpose.feedback.columns import constant
-from rfpose.feedback.fieldcontrol.control import FieldControl
+from rfpose.feedback.fieldcontrol.control import ControlledField
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.fieldcontrol.motion import PROTOTYPE_RATE_RAD_S, move_axes
 from rfpose.feedback.mount import Mount, aim_rows, stack_mounts
 
-__all__ = ["EmergencyField", "Play", "TowerReceiver", "play", "ring_field", "share_on_receiver"]
+__all__ = ["EmergencyField", "EmergencyRun", "TowerReceiver", "play", "ring_field", "share_on_receiver"]
 
 _AIM_EVERY_S = 4.0
 _EVERYTHING_STANDS = (Mode.STOW, Mode.FAULT)
@@ -85,7 +85,7 @@ class EmergencyField:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Play:
+class EmergencyRun:
     """What a field did.
 
     Attributes
@@ -189,14 +189,14 @@ class _Mirrors:
 
 
 def play(
-    control: FieldControl,
+    control: ControlledField,
     field: EmergencyField,
     *,
     time_s: npt.ArrayLike,
     sun_enu: npt.ArrayLike,
     wind_mps: npt.ArrayLike = 0.0,
-    happenings: Mapping[float, Callable[[FieldControl], object]] | None = None,
-) -> Play:
+    happenings: Mapping[float, Callable[[ControlledField], object]] | None = None,
+) -> EmergencyRun:
     """Return what a field does: steps its control, moves its axes, adds up its flux.
 
     Parameters
@@ -274,9 +274,9 @@ class _Tally:
         self._stowed_s[~stowed] = np.nan
         self._stowed_s[stowed & np.isnan(self._stowed_s)] = now_s
 
-    def play(self, time_s: FloatArray, axis_rad: FloatArray) -> Play:
+    def play(self, time_s: FloatArray, axis_rad: FloatArray) -> EmergencyRun:
         """Return the whole."""
-        return Play(
+        return EmergencyRun(
             time_s=read_only(time_s),
             flux=read_only(self._flux),
             n_mode=read_only(self._n_mode),

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.feedback.fieldcontrol.modes import TABLE, Event, Mode, follow
+from rfpose.feedback.fieldcontrol.modes import TABLE, Mode, ModeEvent, follow
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings, ModeArray
 from rfpose.feedback.servo.rules import EARTH_RADPS
 
@@ -28,7 +28,7 @@ _ON_RECEIVER = _modes(Mode.APPROACH, Mode.POINT, Mode.TRACK, Mode.DEFOCUS)
 _ON_CALIBRATION = _modes(Mode.CALIBRATE, Mode.SEARCH)
 _UNDER_WAY = _modes(Mode.STOWING, Mode.APPROACH, Mode.SEARCH, Mode.EMERGENCY)
 """Modes that end by themselves."""
-_GUARDED: BoolArray = TABLE[:, Event.HEARTBEAT_LOST] >= 0
+_GUARDED: BoolArray = TABLE[:, ModeEvent.HEARTBEAT_LOST] >= 0
 """Modes that silence ends."""
 
 
@@ -130,7 +130,7 @@ class Heliostats:
         np.copyto(self.hold_rad, axis_rad, where=np.isnan(self.hold_rad))
         self.refused[:] = NOTHING
 
-    def apply(self, index: npt.NDArray[np.int64], event: Event, now_s: float) -> int:
+    def apply(self, index: npt.NDArray[np.int64], event: ModeEvent, now_s: float) -> int:
         """Let one event happen to heliostats; return how many modes it changed."""
         if index.size == 0:
             return 0
@@ -138,8 +138,8 @@ class Heliostats:
         after, refused = follow(before, np.full(index.size, event, np.int8))
         self.refused[index[refused]] = event
         self.n_refused += int(refused.sum())
-        if event in (Event.POINT, Event.TRACK, Event.REFOCUS, Event.ARRIVED):
-            self.open_loop[index[~refused]] = event == Event.POINT
+        if event in (ModeEvent.POINT, ModeEvent.TRACK, ModeEvent.REFOCUS, ModeEvent.ARRIVED):
+            self.open_loop[index[~refused]] = event == ModeEvent.POINT
         other = after != before
         changed = index[other]
         self.mode[changed] = after[other]
@@ -169,7 +169,7 @@ class Heliostats:
         silent = now_s - self.heard_s > limit_s
         if silent.any():
             index = np.flatnonzero(silent & _GUARDED[self.mode])
-            self.n_watchdog += self.apply(index, Event.HEARTBEAT_LOST, now_s)
+            self.n_watchdog += self.apply(index, ModeEvent.HEARTBEAT_LOST, now_s)
 
     def rest(self, now_s: float, until_s: float, *, watchdog_s: float) -> bool:
         """Whether no mode changes until a time, if nothing is heard or seen that was not so before."""
@@ -184,10 +184,10 @@ class Heliostats:
         settings, mode = self.settings, self.mode
         lost = (mode == int(Mode.TRACK)) & ~feedback
         if lost.any():
-            self.apply(np.flatnonzero(lost), Event.FEEDBACK_LOST, now_s)
+            self.apply(np.flatnonzero(lost), ModeEvent.FEEDBACK_LOST, now_s)
         back = (mode == int(Mode.POINT)) & feedback & ~self.open_loop
         if back.any():
-            self.apply(np.flatnonzero(back), Event.FEEDBACK_BACK, now_s)
+            self.apply(np.flatnonzero(back), ModeEvent.FEEDBACK_BACK, now_s)
         if not _UNDER_WAY[mode].any():
             return
         index = np.flatnonzero(mode == Mode.SEARCH)
@@ -199,19 +199,19 @@ class Heliostats:
         self._arrive(index, aim_axis_rad[index], now_s)
         index = np.flatnonzero(mode == Mode.EMERGENCY)
         wait = settings.emergency_hold_s + settings.stow_stagger_s * self.slot[index]
-        self.apply(index[now_s - self.since_s[index] >= wait], Event.HOLD_OVER, now_s)
+        self.apply(index[now_s - self.since_s[index] >= wait], ModeEvent.HOLD_OVER, now_s)
 
     def _arrive(self, index: npt.NDArray[np.int64], goal_rad: FloatArray, now_s: float) -> None:
         there = (np.abs(self.axis_rad[index] - goal_rad) <= self.settings.arrived_rad).all(axis=1)
-        self.apply(index[there], Event.ARRIVED, now_s)
+        self.apply(index[there], ModeEvent.ARRIVED, now_s)
 
     def _search(self, index: npt.NDArray[np.int64], now_s: float, found: BoolArray) -> None:
         settings = self.settings
-        self.apply(index[found[index]], Event.FOUND, now_s)
+        self.apply(index[found[index]], ModeEvent.FOUND, now_s)
         index = index[~found[index]]
         cell = ((now_s - self.since_s[index]) / settings.search_dwell_s).astype(np.int64)
         over = cell >= settings.search_cells
-        self.apply(index[over], Event.NOT_FOUND, now_s)
+        self.apply(index[over], ModeEvent.NOT_FOUND, now_s)
         self.cell[index[~over]] = cell[~over]
         self._aims = None
 

@@ -24,8 +24,8 @@ __all__ = [
     "REFUSED",
     "TABLE",
     "TRANSITIONS",
-    "Event",
     "Mode",
+    "ModeEvent",
     "dot",
     "follow",
     "refusal",
@@ -61,7 +61,7 @@ class Mode(IntEnum):
     """Alive, but its step counts are not to be trusted: does not move."""
 
 
-class Event(IntEnum):
+class ModeEvent(IntEnum):
     """What can happen to a heliostat: commands first, then what it notices itself."""
 
     STOW = 0
@@ -87,88 +87,88 @@ class Event(IntEnum):
     COUNTS_LOST = 20
 
 
-COMMANDS = tuple(event for event in Event if event <= Event.ZERO_COUNTS)
+COMMANDS = tuple(event for event in ModeEvent if event <= ModeEvent.ZERO_COUNTS)
 """Events that are ordered from outside; refused where they do not fit. The others are ignored there."""
 
 REFUSED = -1
 IGNORED = -2
 
 _ON_AIM = {
-    Event.STOW: Mode.STOWING,
-    Event.POINT: Mode.POINT,
-    Event.TRACK: Mode.TRACK,
-    Event.CALIBRATE: Mode.CALIBRATE,
-    Event.DEFOCUS: Mode.DEFOCUS,
-    Event.HOLD: Mode.IDLE,
-    Event.EMERGENCY: Mode.EMERGENCY,
-    Event.HEARTBEAT_LOST: Mode.EMERGENCY,
-    Event.POWER_OFF: Mode.POWER_LOSS,
+    ModeEvent.STOW: Mode.STOWING,
+    ModeEvent.POINT: Mode.POINT,
+    ModeEvent.TRACK: Mode.TRACK,
+    ModeEvent.CALIBRATE: Mode.CALIBRATE,
+    ModeEvent.DEFOCUS: Mode.DEFOCUS,
+    ModeEvent.HOLD: Mode.IDLE,
+    ModeEvent.EMERGENCY: Mode.EMERGENCY,
+    ModeEvent.HEARTBEAT_LOST: Mode.EMERGENCY,
+    ModeEvent.POWER_OFF: Mode.POWER_LOSS,
 }
 
-TRANSITIONS: dict[Mode, dict[Event, Mode]] = {
+TRANSITIONS: dict[Mode, dict[ModeEvent, Mode]] = {
     Mode.STOW: {
-        Event.STOW: Mode.STOW,
-        Event.EMERGENCY: Mode.STOW,
-        Event.APPROACH: Mode.APPROACH,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.STOW: Mode.STOW,
+        ModeEvent.EMERGENCY: Mode.STOW,
+        ModeEvent.APPROACH: Mode.APPROACH,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
     Mode.STOWING: {
-        Event.STOW: Mode.STOWING,
-        Event.EMERGENCY: Mode.STOWING,
-        Event.HOLD: Mode.IDLE,
-        Event.ARRIVED: Mode.STOW,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.EMERGENCY: Mode.STOWING,
+        ModeEvent.HOLD: Mode.IDLE,
+        ModeEvent.ARRIVED: Mode.STOW,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
     Mode.APPROACH: {
-        Event.APPROACH: Mode.APPROACH,
-        Event.STOW: Mode.STOWING,
-        Event.HOLD: Mode.IDLE,
-        Event.EMERGENCY: Mode.EMERGENCY,
-        Event.ARRIVED: Mode.POINT,
-        Event.HEARTBEAT_LOST: Mode.EMERGENCY,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.APPROACH: Mode.APPROACH,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.HOLD: Mode.IDLE,
+        ModeEvent.EMERGENCY: Mode.EMERGENCY,
+        ModeEvent.ARRIVED: Mode.POINT,
+        ModeEvent.HEARTBEAT_LOST: Mode.EMERGENCY,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
-    Mode.POINT: {**_ON_AIM, Event.FEEDBACK_BACK: Mode.TRACK},
-    Mode.TRACK: {**_ON_AIM, Event.FEEDBACK_LOST: Mode.POINT},
-    Mode.CALIBRATE: {**_ON_AIM, Event.SEARCH: Mode.SEARCH},
+    Mode.POINT: {**_ON_AIM, ModeEvent.FEEDBACK_BACK: Mode.TRACK},
+    Mode.TRACK: {**_ON_AIM, ModeEvent.FEEDBACK_LOST: Mode.POINT},
+    Mode.CALIBRATE: {**_ON_AIM, ModeEvent.SEARCH: Mode.SEARCH},
     Mode.SEARCH: {
-        Event.STOW: Mode.STOWING,
-        Event.SEARCH: Mode.SEARCH,
-        Event.CALIBRATE: Mode.CALIBRATE,
-        Event.DEFOCUS: Mode.DEFOCUS,
-        Event.HOLD: Mode.IDLE,
-        Event.EMERGENCY: Mode.EMERGENCY,
-        Event.FOUND: Mode.CALIBRATE,
-        Event.NOT_FOUND: Mode.DEFOCUS,
-        Event.HEARTBEAT_LOST: Mode.EMERGENCY,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.SEARCH: Mode.SEARCH,
+        ModeEvent.CALIBRATE: Mode.CALIBRATE,
+        ModeEvent.DEFOCUS: Mode.DEFOCUS,
+        ModeEvent.HOLD: Mode.IDLE,
+        ModeEvent.EMERGENCY: Mode.EMERGENCY,
+        ModeEvent.FOUND: Mode.CALIBRATE,
+        ModeEvent.NOT_FOUND: Mode.DEFOCUS,
+        ModeEvent.HEARTBEAT_LOST: Mode.EMERGENCY,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
     Mode.DEFOCUS: {
-        Event.STOW: Mode.STOWING,
-        Event.DEFOCUS: Mode.DEFOCUS,
-        Event.REFOCUS: Mode.POINT,
-        Event.CALIBRATE: Mode.CALIBRATE,
-        Event.HOLD: Mode.IDLE,
-        Event.EMERGENCY: Mode.EMERGENCY,
-        Event.HEARTBEAT_LOST: Mode.EMERGENCY,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.DEFOCUS: Mode.DEFOCUS,
+        ModeEvent.REFOCUS: Mode.POINT,
+        ModeEvent.CALIBRATE: Mode.CALIBRATE,
+        ModeEvent.HOLD: Mode.IDLE,
+        ModeEvent.EMERGENCY: Mode.EMERGENCY,
+        ModeEvent.HEARTBEAT_LOST: Mode.EMERGENCY,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
     Mode.EMERGENCY: {
-        Event.EMERGENCY: Mode.EMERGENCY,
-        Event.STOW: Mode.STOWING,
-        Event.REFOCUS: Mode.POINT,
-        Event.HOLD_OVER: Mode.STOWING,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.EMERGENCY: Mode.EMERGENCY,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.REFOCUS: Mode.POINT,
+        ModeEvent.HOLD_OVER: Mode.STOWING,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
     Mode.IDLE: {
-        Event.STOW: Mode.STOWING,
-        Event.HOLD: Mode.IDLE,
-        Event.EMERGENCY: Mode.EMERGENCY,
-        Event.HEARTBEAT_LOST: Mode.EMERGENCY,
-        Event.POWER_OFF: Mode.POWER_LOSS,
+        ModeEvent.STOW: Mode.STOWING,
+        ModeEvent.HOLD: Mode.IDLE,
+        ModeEvent.EMERGENCY: Mode.EMERGENCY,
+        ModeEvent.HEARTBEAT_LOST: Mode.EMERGENCY,
+        ModeEvent.POWER_OFF: Mode.POWER_LOSS,
     },
-    Mode.POWER_LOSS: {Event.POWER_ON: Mode.IDLE, Event.COUNTS_LOST: Mode.FAULT},
-    Mode.FAULT: {Event.ZERO_COUNTS: Mode.IDLE, Event.POWER_OFF: Mode.POWER_LOSS},
+    Mode.POWER_LOSS: {ModeEvent.POWER_ON: Mode.IDLE, ModeEvent.COUNTS_LOST: Mode.FAULT},
+    Mode.FAULT: {ModeEvent.ZERO_COUNTS: Mode.IDLE, ModeEvent.POWER_OFF: Mode.POWER_LOSS},
 }
 """Every transition there is."""
 
@@ -186,10 +186,10 @@ _WHY: dict[Mode, str] = {
     Mode.POWER_LOSS: "it has no power",
     Mode.FAULT: "its step counts are not valid: home it and zero them first",
 }
-_WHY_EVENT: dict[Event, str] = {
-    Event.ZERO_COUNTS: "its step counts are valid and in use",
-    Event.SEARCH: "a search starts on the calibration target: order calibrate first",
-    Event.REFOCUS: "it is not defocused",
+_WHY_EVENT: dict[ModeEvent, str] = {
+    ModeEvent.ZERO_COUNTS: "its step counts are valid and in use",
+    ModeEvent.SEARCH: "a search starts on the calibration target: order calibrate first",
+    ModeEvent.REFOCUS: "it is not defocused",
 }
 # where the mode's reason tells more than the event's
 _MODE_SAYS_MORE = frozenset(
@@ -197,17 +197,17 @@ _MODE_SAYS_MORE = frozenset(
 )
 
 
-def refusal(mode: Mode, command: Event) -> str | None:
+def refusal(mode: Mode, command: ModeEvent) -> str | None:
     """Return why a command is refused in a mode; None where it is not."""
     if command not in COMMANDS or command in TRANSITIONS[mode]:
         return None
-    of_event = mode not in _MODE_SAYS_MORE or (command == Event.ZERO_COUNTS and mode != Mode.POWER_LOSS)
+    of_event = mode not in _MODE_SAYS_MORE or (command == ModeEvent.ZERO_COUNTS and mode != Mode.POWER_LOSS)
     why = _WHY_EVENT.get(command, _WHY[mode]) if of_event else _WHY[mode]
     return f"{command.name} refused: {why}"
 
 
 def _table() -> npt.NDArray[np.int8]:
-    table = np.full((len(Mode), len(Event)), IGNORED, np.int8)
+    table = np.full((len(Mode), len(ModeEvent)), IGNORED, np.int8)
     table[:, list(COMMANDS)] = REFUSED
     for mode, row in TRANSITIONS.items():
         for event, after in row.items():
@@ -227,7 +227,7 @@ def follow(
     Parameters
     ----------
     mode, event : (heliostat,)
-        `Mode` and `Event` of each.
+        `Mode` and `ModeEvent` of each.
     """
     after = TABLE[mode, event]
     return np.where(after < 0, mode, after).astype(np.int8), after == REFUSED

@@ -140,7 +140,7 @@ class Orders:
     changed : (heliostat,)
         Mode is not that of the step before.
     refused : (heliostat,)
-        `Event` that the heliostat itself refused since the step before; −1: none.
+        `ModeEvent` that the heliostat itself refused since the step before; −1: none.
     unreachable : (heliostat,)
         Approaches an aim that its axes cannot reach, and waits.
     alarms

@@ -10,24 +10,24 @@ from rfpose.checks import FloatArray
 from rfpose.feedback.fieldcontrol import packets
 from rfpose.feedback.fieldcontrol.bus import BusSettings, MessageStatus, poll
 from rfpose.feedback.fieldcontrol.local import NOTHING, Heliostats
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.feedback.fieldcontrol.packets import MessageType
 from rfpose.feedback.fieldcontrol.records import BoolArray, FieldSettings
 
 __all__ = ["MESSAGE_OF_COMMAND", "Wire"]
 
 MESSAGE_OF_COMMAND = {
-    Event.STOW: MessageType.STOW,
-    Event.APPROACH: MessageType.STATE_APPROACH,
-    Event.POINT: MessageType.POINT,
-    Event.TRACK: MessageType.STATE_TRACK,
-    Event.CALIBRATE: MessageType.CALIBRATE,
-    Event.SEARCH: MessageType.SEARCH,
-    Event.DEFOCUS: MessageType.DEFOCUS,
-    Event.REFOCUS: MessageType.REFOCUS,
-    Event.HOLD: MessageType.STATE_IDLE,
-    Event.EMERGENCY: MessageType.STOW_ALL,
-    Event.ZERO_COUNTS: MessageType.ZERO_COUNTS,
+    ModeEvent.STOW: MessageType.STOW,
+    ModeEvent.APPROACH: MessageType.STATE_APPROACH,
+    ModeEvent.POINT: MessageType.POINT,
+    ModeEvent.TRACK: MessageType.STATE_TRACK,
+    ModeEvent.CALIBRATE: MessageType.CALIBRATE,
+    ModeEvent.SEARCH: MessageType.SEARCH,
+    ModeEvent.DEFOCUS: MessageType.DEFOCUS,
+    ModeEvent.REFOCUS: MessageType.REFOCUS,
+    ModeEvent.HOLD: MessageType.STATE_IDLE,
+    ModeEvent.EMERGENCY: MessageType.STOW_ALL,
+    ModeEvent.ZERO_COUNTS: MessageType.ZERO_COUNTS,
 }
 """The message that carries each command."""
 _COMMAND_OF_MESSAGE = {kind: event for event, kind in MESSAGE_OF_COMMAND.items()}
@@ -99,7 +99,7 @@ class Wire:
         self.n_fate = np.zeros((3, len(MessageStatus)), np.int64)
         self.n_sent = 0
 
-    def send(self, command: Event, to: BoolArray, now_s: float, *, urgent: bool, from_centre: bool = True) -> None:
+    def send(self, command: ModeEvent, to: BoolArray, now_s: float, *, urgent: bool, from_centre: bool = True) -> None:
         """Put an order on its way: the centre repeats it to each cluster until that has it."""
         fresh = to & (self.pending != command)
         if not fresh.any():
@@ -220,7 +220,7 @@ class Wire:
     def _hear_forged_question(self, i: int, now_s: float) -> None:
         """Do as a question with wrong bits says that the checksum missed, if it still is for this heliostat."""
         waits = self.pending[i] != NOTHING
-        kind = MESSAGE_OF_COMMAND[Event(self.pending[i])] if waits else MessageType.QUERY_STEP_COUNTS
+        kind = MESSAGE_OF_COMMAND[ModeEvent(self.pending[i])] if waits else MessageType.QUERY_STEP_COUNTS
         address = int(self.heliostats.slot[i]) + 1
         raw = self._forged(address, kind)
         if raw[0] == address and int(raw[4]) in _COMMAND_OF_MESSAGE:
@@ -241,4 +241,4 @@ class Wire:
             return
         self.done[index] = True
         for event in np.unique(self.pending[index]):
-            self.heliostats.apply(index[self.pending[index] == event], Event(event), now_s)
+            self.heliostats.apply(index[self.pending[index] == event], ModeEvent(event), now_s)

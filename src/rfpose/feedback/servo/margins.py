@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo.law import PiLaw
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import StructureMode
 
 __all__ = [
     "LEAST_GAIN_MARGIN",
@@ -93,7 +93,7 @@ class SampledPlant:
     interval_s: float
 
 
-def _plant(structure: Structure | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _plant(structure: StructureMode | None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State space from speed to mirror angle: motor angle, mirror angle, its rate."""
     if structure is None:
         return np.zeros((1, 1)), np.ones(1), np.ones(1)
@@ -113,7 +113,7 @@ def _over(a: FloatArray, b: FloatArray, time_s: float) -> tuple[FloatArray, Floa
     return moved[:n, :n], moved[:n, n]
 
 
-def sampled_plant(structure: Structure | None, *, interval_s: float, latency_s: float = 0.0) -> SampledPlant:
+def sampled_plant(structure: StructureMode | None, *, interval_s: float, latency_s: float = 0.0) -> SampledPlant:
     """Return the exact motion of motor and structure over an interval.
 
     Parameters
@@ -154,7 +154,7 @@ def sampled_response(law: PiLaw, plant: SampledPlant, frequency_hz: npt.ArrayLik
 
 def continuous_response(
     law: PiLaw,
-    structure: Structure | None,
+    structure: StructureMode | None,
     frequency_hz: npt.ArrayLike,
     *,
     interval_s: float = 0.0,
@@ -203,7 +203,7 @@ def _closed_loop(law: PiLaw, plant: SampledPlant) -> FloatArray:
     return out
 
 
-def is_stable(law: PiLaw, structure: Structure | None, *, interval_s: float, latency_s: float = 0.0) -> bool:
+def is_stable(law: PiLaw, structure: StructureMode | None, *, interval_s: float, latency_s: float = 0.0) -> bool:
     """Whether the closed loop, its errors small and not quantised, settles."""
     loop = _closed_loop(law, sampled_plant(structure, interval_s=interval_s, latency_s=latency_s))
     if law.integral_gain_per_s2 == 0.0:
@@ -242,7 +242,7 @@ def _crossing(frequency: FloatArray, values: FloatArray, level: float) -> float:
     return float(frequency[i] * (frequency[i + 1] / frequency[i]) ** part)
 
 
-def margins(law: PiLaw, structure: Structure | None, *, interval_s: float = 1.0, latency_s: float = 0.0) -> Margins:
+def margins(law: PiLaw, structure: StructureMode | None, *, interval_s: float = 1.0, latency_s: float = 0.0) -> Margins:
     """Return the margins of a sampled loop.
 
     Parameters
@@ -298,7 +298,7 @@ def margins(law: PiLaw, structure: Structure | None, *, interval_s: float = 1.0,
 
 def check_law(
     law: PiLaw,
-    structure: Structure | None,
+    structure: StructureMode | None,
     *,
     interval_s: float = 1.0,
     latency_s: float = 0.0,
@@ -339,7 +339,7 @@ def check_law(
 
 
 def design_law(
-    structure: Structure | None,
+    structure: StructureMode | None,
     *,
     interval_s: float = 1.0,
     latency_s: float = 0.0,
@@ -387,7 +387,7 @@ def design_law(
 
 
 def limit_cycle_rad(
-    law: PiLaw, structure: Structure | None, *, interval_s: float = 0.0, latency_s: float = 0.0
+    law: PiLaw, structure: StructureMode | None, *, interval_s: float = 0.0, latency_s: float = 0.0
 ) -> float:
     """Return the amplitude of the oscillation about zero that levels cause (Edwards 6.2) [rad].
 
@@ -417,7 +417,7 @@ def limit_cycle_rad(
 
 def sensitivity(
     law: PiLaw,
-    structure: Structure | None,
+    structure: StructureMode | None,
     frequency_hz: npt.ArrayLike,
     *,
     interval_s: float = 1.0,

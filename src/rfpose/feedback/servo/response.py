@@ -12,7 +12,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo import _kernels
 from rfpose.feedback.servo.law import PiLaw, Stepper
 from rfpose.feedback.servo.margins import check_law, sampled_plant
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import StructureMode
 
 __all__ = ["MotorCounts", "Response", "run_loop"]
 
@@ -63,7 +63,7 @@ class Response:
 
 def run_loop(
     law: PiLaw,
-    structure: Structure | None,
+    structure: StructureMode | None,
     *,
     command_rad: npt.ArrayLike,
     disturbance_rad: npt.ArrayLike = 0.0,

@@ -34,7 +34,7 @@ from rfpose.feedback.servo.margins import is_stable
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import (
     STEEP,
-    Calibration,
+    CalibrationPlan,
     calibration_of,
     posture_scatter_rad,
     prior_sigma,
@@ -51,7 +51,7 @@ from rfpose.feedback.tracking.sampled_loop import SampledLoop
 from rfpose.feedback.tracking.timeline import Day, site_of
 from rfpose.scenario import Scenario
 
-__all__ = ["Budget", "SampledLoop", "mean_intercept", "track_budget"]
+__all__ = ["MethodBudget", "SampledLoop", "mean_intercept", "track_budget"]
 
 _N_MIRROR, _N_DAY, _N_TIME = 48, 12, 48
 _HARMONICS = np.arange(1, 17)
@@ -67,7 +67,7 @@ Squares = dict[str, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Budget:
+class MethodBudget:
     """What one method will be off by: angles of the normal, both directions together, rms over field and time [rad].
 
     Attributes
@@ -192,7 +192,7 @@ def mean_intercept(table: FloatArray, total_rad: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.interp(angle, np.linspace(0.0, TOP_RAD, len(table)), table) @ weight)
 
 
-def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -> Budget:
+def track_budget(scenario: Scenario, method: str, *, count: int | None = None) -> MethodBudget:
     """Predict what a method will be off by on the scenario's days, once `settle_s` have passed.
 
     Parameters
@@ -240,7 +240,7 @@ class _Tracked:
 class _Looked:
     """A calibration so many days after the run's first: its looks, and what it makes of them."""
 
-    calibration: Calibration
+    calibration: CalibrationPlan
     since_first: int
     looks: PosturesInTime
 
@@ -291,7 +291,7 @@ class _Propagation:
             if not name.startswith("receiver_plane")
         }
 
-    def budget(self) -> Budget:
+    def budget(self) -> MethodBudget:
         """Return the budget: parts are averaged over days, mirrors and times."""
         every, table = self._plant.days, self._plant.table
         squares: list[dict[str, float]] = []
@@ -302,7 +302,7 @@ class _Propagation:
             light += self._light(tracked, found)
             squares.append({name: float(np.nanmean(value)) for name, value in found.items()})
         parts = {f"{name}_rad": float(np.sqrt(np.mean([s[name] for s in squares]))) for name in squares[0]}
-        budget = Budget(method=self._method.name, **parts)
+        budget = MethodBudget(method=self._method.name, **parts)
         day_kwh, year_kwh = self._offered_kwh()
         return dataclasses.replace(
             budget,

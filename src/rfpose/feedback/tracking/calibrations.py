@@ -29,7 +29,7 @@ __all__ = [
     "LEARNED",
     "STEEP",
     "ZERO_NAMES",
-    "Calibration",
+    "CalibrationPlan",
     "Calibrator",
     "calibration_of",
     "correct_zeros",
@@ -60,7 +60,7 @@ _NO_ROW = aim_rows(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]), source_
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class CalibrationPlan:
     """How a model of a mount is made from looks at it.
 
     Attributes
@@ -93,33 +93,33 @@ class Calibration:
         return int(np.floor(cycles * self.interval_days - half))
 
 
-def calibration_of(knowledge: Knowledge, plant: Plant, radio: RadioByPosture | None) -> Calibration | None:
+def calibration_of(knowledge: Knowledge, plant: Plant, radio: RadioByPosture | None) -> CalibrationPlan | None:
     """Return how a method comes to its knowledge; None: it keeps to the mounts as planned."""
     plan = plant.scenario.tracking
     camera, drone, by_radio = plan.camera, plan.drone, plan.radio_model
     if knowledge == "camera":
-        return Calibration(
+        return CalibrationPlan(
             instrument=CameraSpots(plant), interval_days=camera.interval_days, n_look=camera.points_per_day,
             free=PARAMETER_SETS["malan"] + (WORMS if camera.worm else ()), place=20,
         )  # fmt: skip
     if knowledge == "drone":
-        return Calibration(
+        return CalibrationPlan(
             instrument=DroneFlights(plant), interval_days=drone.interval_days, n_look=drone.points,
             free=(*PARAMETER_SETS["edwards-4"], "nonorthogonality_rad"), place=21,
         )  # fmt: skip
     if knowledge == "radio":
         assert radio is not None
-        return Calibration(
+        return CalibrationPlan(
             instrument=RadioPoses(plant, radio), interval_days=by_radio.interval_days, n_look=by_radio.points_per_day,
             free=LEARNED, place=22,
         )  # fmt: skip
     if knowledge == "bias":
-        return Calibration(
+        return CalibrationPlan(
             instrument=CameraSpots(plant), interval_days=camera.bias_interval_days, n_look=_TURNS, free=ZERO_NAMES,
             corrections=1, place=24,
         )  # fmt: skip
     if knowledge == "berenguel":
-        return Calibration(
+        return CalibrationPlan(
             instrument=CameraSpots(plant), interval_days=camera.berenguel_interval_days, n_look=_TURNS, free=ZERO_NAMES,
             corrections=camera.berenguel_corrections, tolerance_m=1e-3 * camera.berenguel_tolerance_mm, place=24,
         )  # fmt: skip
@@ -195,7 +195,7 @@ class Calibrator:
         bent = look.tilted(gusts.bend_rad(gusts.draw(rng, (n, m))) + gusts.swing_rad(rng, (n, m)))
         return replace(look, normal_enu=bent)
 
-    def _fitted(self, start: FloatArray, calibration: Calibration, since_first: int) -> FloatArray:
+    def _fitted(self, start: FloatArray, calibration: CalibrationPlan, since_first: int) -> FloatArray:
         """Fit all mirrors; one that cannot be fitted keeps its start."""
         plant, free = self._plant, calibration.free
         rng = generator(plant.seed, calibration.place, since_first + _DAYS_BEFORE)
@@ -216,7 +216,7 @@ class Calibrator:
         p[np.ix_(good, columns_of(free))] = found.working[good]
         return p
 
-    def _corrected(self, start: FloatArray, calibration: Calibration, since_first: int) -> FloatArray:
+    def _corrected(self, start: FloatArray, calibration: CalibrationPlan, since_first: int) -> FloatArray:
         """Take off both axes what a camera sees the spot to be off, once a mirror, in whole motor steps."""
         plant, target = self._plant, calibration.instrument.target_enu_m
         rng = generator(plant.seed, calibration.place, since_first + _DAYS_BEFORE, calibration.corrections)

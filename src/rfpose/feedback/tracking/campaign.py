@@ -16,8 +16,8 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels as mount_kernels
 from rfpose.feedback.columns import P
-from rfpose.feedback.fieldcontrol.control import FieldControl
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.control import ControlledField
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.feedback.optics import reflect, target_offset_m
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import correct_zeros
@@ -68,7 +68,7 @@ class Campaign:
         self._waiting += [i for i in index.tolist() if i not in self._waiting]
 
     def proceed(
-        self, control: FieldControl, s: int, day: Day, aim_enu_m: FloatArray, state: FloatArray, model: FloatArray,
+        self, control: ControlledField, s: int, day: Day, aim_enu_m: FloatArray, state: FloatArray, model: FloatArray,
         true: FloatArray,
     ) -> None:  # fmt: skip
         """Go on at step ``s`` of the day: order the next mirror, look at the one that is there, correct its model.
@@ -92,14 +92,14 @@ class Campaign:
         silent_s = self._plan_control().watchdog_intervals * self._plan.control_interval_s
         silent = silent_s < control.report_age_s[i] < np.inf
         if now_s - self._there["called_s"] > _LONGEST_S or silent:
-            self._dismiss(control, now_s, "given up", order=Event.TRACK if reported == Mode.CALIBRATE else None)
+            self._dismiss(control, now_s, "given up", order=ModeEvent.TRACK if reported == Mode.CALIBRATE else None)
         elif control.waiting[i]:
             return
         elif reported == Mode.SEARCH:
             self._there["stage"] = "searching"
             self._search(i, s, day, aim_enu_m, state, model, true)
         elif reported == Mode.DEFOCUS and stage == "searching":
-            self._dismiss(control, now_s, "not found", order=Event.REFOCUS)
+            self._dismiss(control, now_s, "not found", order=ModeEvent.REFOCUS)
         elif reported != Mode.CALIBRATE:  # something else took it away
             self._dismiss(control, now_s, "given up", order=None)
         elif stage != "there":
@@ -111,18 +111,18 @@ class Campaign:
         assert self._plan.field_control is not None
         return self._plan.field_control
 
-    def _call(self, control: FieldControl, s: int) -> None:
+    def _call(self, control: ControlledField, s: int) -> None:
         """Order the first mirror of the queue that can come."""
         reported = control.reported_mode
         for i in self._waiting:
             if reported[i] in (Mode.POINT, Mode.TRACK, Mode.DEFOCUS) and not control.waiting[i]:
-                if control.command(Event.CALIBRATE, [i]).accepted[i]:
+                if control.command(ModeEvent.CALIBRATE, [i]).accepted[i]:
                     self._waiting.remove(i)
                     now_s = s * self._plan.servo_interval_s
                     self._there = {"mirror": i, "stage": "called", "called_s": now_s, "searched": False, "looks": []}
                 return
 
-    def _dismiss(self, control: FieldControl, now_s: float, outcome: str, *, order: Event | None) -> None:
+    def _dismiss(self, control: ControlledField, now_s: float, outcome: str, *, order: ModeEvent | None) -> None:
         assert self._there is not None
         i = int(self._there["mirror"])
         if order is not None:
@@ -164,7 +164,7 @@ class Campaign:
         return bool((np.abs(spot_m) <= 0.5 * self._plan_control().calibration_target_m).all())
 
     def _look(
-        self, control: FieldControl, i: int, s: int, day: Day, state: FloatArray, model: FloatArray, true: FloatArray
+        self, control: ControlledField, i: int, s: int, day: Day, state: FloatArray, model: FloatArray, true: FloatArray
     ) -> None:
         """Look at the mirror for a while; not on the target: let it search."""
         assert self._there is not None
@@ -173,7 +173,7 @@ class Campaign:
         spot = self._spot_m(i, s, day, normal, centre)
         if not self._on_target(spot):
             self._there |= {"stage": "sought", "searched": True, "looks": []}
-            control.command(Event.SEARCH, [i])
+            control.command(ModeEvent.SEARCH, [i])
             return
         self._there["looks"].append(spot.tolist())
         if now_s - self._there["since_s"] < 2.0 * dwell_s:
@@ -183,7 +183,7 @@ class Campaign:
         if np.hypot(*offset) > 1e-3 * self._plan.camera.berenguel_tolerance_mm:
             self._correct(i, offset, normal, centre, model)
             outcome = "corrected"
-        self._dismiss(control, now_s, outcome, order=Event.TRACK)
+        self._dismiss(control, now_s, outcome, order=ModeEvent.TRACK)
 
     def _search(
         self, i: int, s: int, day: Day, aim_enu_m: FloatArray, state: FloatArray, model: FloatArray, true: FloatArray

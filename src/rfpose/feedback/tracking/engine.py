@@ -22,7 +22,7 @@ from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.jit import load_numba
 
-__all__ = ["Arrays", "Engine", "StretchDraws", "always_track", "empty_courses", "empty_tally"]
+__all__ = ["Arrays", "MethodEngine", "StretchDraws", "always_track", "empty_courses", "empty_tally"]
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -45,7 +45,7 @@ class StretchDraws:
     bias: FloatArray
 
 
-class Engine:
+class MethodEngine:
     """Mirrors of one method; `stretch` prepares steps of a day, `go` takes the mirrors through them.
 
     Parameters

@@ -11,11 +11,11 @@ from rfpose import geometry
 from rfpose.checks import FloatArray, as_positive, read_only
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.feedback.columns import constant
-from rfpose.feedback.fieldcontrol.control import FieldControl
+from rfpose.feedback.fieldcontrol.control import ControlledField
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import Calibrator
-from rfpose.feedback.tracking.engine import Engine, StretchDraws, always_track, empty_courses, empty_tally
+from rfpose.feedback.tracking.engine import MethodEngine, StretchDraws, always_track, empty_courses, empty_tally
 from rfpose.feedback.tracking.hidden import generator
 from rfpose.feedback.tracking.loops import check_gains
 from rfpose.feedback.tracking.methods import METHODS
@@ -23,7 +23,7 @@ from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.radio import RadioByPosture, RadioErrors
 from rfpose.scenario import Scenario
 
-__all__ = ["MOST_MIRRORS", "LiveField", "Moment", "live_scenario"]
+__all__ = ["MOST_MIRRORS", "FieldMoment", "LiveField", "live_scenario"]
 
 MOST_MIRRORS = 50
 """A live field has no more mirrors than this: the first of the scenario."""
@@ -35,7 +35,7 @@ _CALM_MPS = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
+class FieldMoment:
     """A field at the end of a step; rows are mirrors.
 
     Attributes
@@ -121,7 +121,7 @@ class LiveField:
     """A field in closed radio loop on the scenario's first day; go on with `step`, disturb it at any time.
 
     Mounts, drives, wind, radio and loop are those of `Simulation`, whose step this takes one control interval at a
-    time. In an emergency `FieldControl` tells where the axes go, at the drives' speed.
+    time. In an emergency `ControlledField` tells where the axes go, at the drives' speed.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ class LiveField:
         self._plant = plant = Plant(scenario, count=min(MOST_MIRRORS, len(scenario.heliostat)), seed=int(seed))
         plant.check_reach()
         self.field, self._day = plant.field, plant.days[0]
-        self._engine = Engine(METHODS["radio"], plant)
+        self._engine = MethodEngine(METHODS["radio"], plant)
         self._scenario = scenario
         self._servo_s = scenario.tracking.servo_interval_s
         self._interval = self._engine.loop.interval
@@ -156,7 +156,7 @@ class LiveField:
         self._gusts: list[tuple[float, float, float]] = []
         self._stopped = np.zeros(len(self.field), np.bool_)
         self._renew = np.zeros(len(self.field), np.bool_)
-        self._control: FieldControl | None = None
+        self._control: ControlledField | None = None
         self._radio_due = self._at
         self._radio_errors = self._measure()
         self._engine.rest(self._nearest_count())
@@ -213,7 +213,7 @@ class LiveField:
     def emergency(self) -> None:
         """Order the field off its target at full speed, then into stow."""
         if self._control is None:
-            self._control = FieldControl(
+            self._control = ControlledField(
                 aim_enu_m=self.field.target[:, :3],
                 pivot_enu_m=self.field.pivot_enu_m,
                 mode=Mode.TRACK,
@@ -235,7 +235,7 @@ class LiveField:
 
     # -- going on ------------------------------------------------------------------------------------------
 
-    def step(self) -> Moment:
+    def step(self) -> FieldMoment:
         """Go on by one control interval and return what is then.
 
         Raises
@@ -252,7 +252,7 @@ class LiveField:
         normal, error, mode = self._go(steps, extra)
         self._at += self._interval
         sigma = np.where(self._radio_errors.solved, self._radio_errors.sigma_rad, np.nan)
-        return Moment(
+        return FieldMoment(
             unix_s=float(self._day.unix_s[steps][-1]),
             sun_enu=read_only(self._day.sun_enu[self._at - 1].copy()),
             normal_enu=read_only(normal),
@@ -327,7 +327,7 @@ class LiveField:
             bias=self._radio_errors.bias_rad,
         )
 
-    def _obey(self, control: FieldControl, i_step: int, tasks: _kernels.Tasks) -> npt.NDArray[np.int8]:
+    def _obey(self, control: ControlledField, i_step: int, tasks: _kernels.Tasks) -> npt.NDArray[np.int8]:
         """Let field control say where the axes go; return the modes."""
         home = constant(self.field.constant, "angle_at_zero_rad").copy()
         per_rad = constant(self.field.constant, "counts_per_unit")

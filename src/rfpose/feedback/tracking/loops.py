@@ -12,7 +12,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.servo import DriveNumbers, Stepper
 from rfpose.feedback.servo.margins import LEAST_GAIN_MARGIN, Margins, margins
 from rfpose.feedback.servo.rules import EARTH_RADPS
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import StructureMode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.capture import N_CAPTURE, TOP_RAD
 from rfpose.feedback.tracking.methods import Method
@@ -46,7 +46,7 @@ def loop_of(scenario: Scenario, feedback: int) -> SampledLoop | None:
     return None
 
 
-def loop_margins(loop: SampledLoop, structure: Structure | None = None) -> Margins:
+def loop_margins(loop: SampledLoop, structure: StructureMode | None = None) -> Margins:
     """Return the margins of a loop on a motor that goes at once where it is told.
 
     At the next tick a measurement has acted in full if the latency is less than the interval: what counts is the

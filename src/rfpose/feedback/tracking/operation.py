@@ -19,8 +19,8 @@ from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.feedback.columns import constant
 from rfpose.feedback.fieldcontrol.bus import BusSettings
-from rfpose.feedback.fieldcontrol.control import FieldControl, FieldSettings, Orders
-from rfpose.feedback.fieldcontrol.modes import Event, Mode
+from rfpose.feedback.fieldcontrol.control import ControlledField, FieldSettings, Orders
+from rfpose.feedback.fieldcontrol.modes import Mode, ModeEvent
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.campaign import Campaign
 from rfpose.feedback.tracking.hidden import HiddenField, generator
@@ -38,14 +38,14 @@ _SILENT_FRAMES = 5.0
 _WORDS_AHEAD = 4
 """Control intervals that are told at once while nothing happens; so much later may a mode show that radio is lost."""
 _COMMANDS = {
-    "stow": Event.STOW,
-    "approach": Event.APPROACH,
-    "point": Event.POINT,
-    "track": Event.TRACK,
-    "defocus": Event.DEFOCUS,
-    "refocus": Event.REFOCUS,
-    "hold": Event.HOLD,
-    "zero-counts": Event.ZERO_COUNTS,
+    "stow": ModeEvent.STOW,
+    "approach": ModeEvent.APPROACH,
+    "point": ModeEvent.POINT,
+    "track": ModeEvent.TRACK,
+    "defocus": ModeEvent.DEFOCUS,
+    "refocus": ModeEvent.REFOCUS,
+    "hold": ModeEvent.HOLD,
+    "zero-counts": ModeEvent.ZERO_COUNTS,
 }
 _FOLLOWS = np.isin(np.arange(len(Mode)), [Mode.POINT, Mode.TRACK, Mode.CALIBRATE, Mode.SEARCH, Mode.DEFOCUS])
 _ON_RECEIVER = np.isin(np.arange(len(Mode)), [Mode.POINT, Mode.TRACK])
@@ -75,7 +75,7 @@ class Operation:
         self._held = plan.field_control.between_messages == "held"
         n = len(field)
         step_rad = 2.0 * np.pi / plan.drive.steps_per_turn * (plan.drive.microsteps + plan.drive.dead_band_steps)
-        self.control = FieldControl(
+        self.control = ControlledField(
             aim_enu_m=field.target[:, :3],
             pivot_enu_m=field.pivot_enu_m,
             calibration_enu_m=plan.calibration_target_enu_m,
@@ -251,12 +251,12 @@ class Operation:
             return
         reported, free = self.control.reported_mode, ~self.control.waiting
         if s > self._works_until:
-            self._order(Event.STOW, free & ~np.isin(reported, _BACK))
+            self._order(ModeEvent.STOW, free & ~np.isin(reported, _BACK))
         elif not self.control.alarms:
-            self._order(Event.APPROACH, free & self._out & (reported == Mode.STOW))
-            self._order(Event.STOW, free & self._out & (reported == Mode.IDLE))
+            self._order(ModeEvent.APPROACH, free & self._out & (reported == Mode.STOW))
+            self._order(ModeEvent.STOW, free & self._out & (reported == Mode.IDLE))
 
-    def _order(self, command: Event, to: npt.NDArray[np.bool_]) -> None:
+    def _order(self, command: ModeEvent, to: npt.NDArray[np.bool_]) -> None:
         if to.any():
             self.control.command(command, to)
 

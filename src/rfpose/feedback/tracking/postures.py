@@ -117,7 +117,7 @@ def aimed(
 def aim_count(
     model: FloatArray, constants: FloatArray, sun_enu: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, npt.NDArray[np.int8]]:
-    """Return counts at which models send the sun to `Field.target` (mirror, 2), NaN where they cannot, and why.
+    """Return counts at which models send the sun to `HiddenField.target` (mirror, 2), NaN where they cannot, and why.
 
     The status is a `CommandStatus` of each mirror.
     """

@@ -14,13 +14,13 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels
 from rfpose.feedback.tracking.calibrations import Calibrator
-from rfpose.feedback.tracking.engine import Arrays, Engine, StretchDraws, always_track, empty_courses, empty_tally
+from rfpose.feedback.tracking.engine import Arrays, MethodEngine, StretchDraws, always_track, empty_courses, empty_tally
 from rfpose.feedback.tracking.hidden import ZEROS
 from rfpose.feedback.tracking.methods import Method
 from rfpose.feedback.tracking.operation import Operation
 from rfpose.feedback.tracking.plant import Plant
 
-__all__ = ["Curves", "Kept", "MethodRun", "Segment", "Sums"]
+__all__ = ["Curves", "KeptCourses", "MethodRun", "MethodSums", "Segment"]
 
 _ARRAYS = (
     "total", "by_mode", "by_outage", "hours", "histogram", "curve", "trace", "stored_error", "mode_count", "mode",
@@ -28,7 +28,7 @@ _ARRAYS = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Kept:
+class KeptCourses:
     """Of which mirrors courses are kept, by row (stored,), and how many servo steps apart."""
 
     stored: npt.NDArray[np.int64]
@@ -46,7 +46,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sums:
+class MethodSums:
     """What one method's mirrors added up to.
 
     Attributes
@@ -121,12 +121,12 @@ class MethodRun:
         Of which mirrors courses are kept.
     """
 
-    def __init__(self, method: Method, plant: Plant, calibrator: Calibrator, kept: Kept) -> None:
+    def __init__(self, method: Method, plant: Plant, calibrator: Calibrator, kept: KeptCourses) -> None:
         self._method, self._plant, self._calibrator, self._kept = method, plant, calibrator, kept
         n, n_kept, n_day = len(plant.field), len(kept.stored), len(plant.days)
         n_time = sum(-(-len(day.unix_s) // kept.stride) for day in plant.days)
         self._n_outage = len(plant.scenario.tracking.radio.outages)
-        self.engine = Engine(method, plant)
+        self.engine = MethodEngine(method, plant)
         empty = empty_tally(n, self._n_outage)
         self.total, self.by_mode = (np.repeat(part[None], n_day, axis=0) for part in (empty.total, empty.by_mode))
         self.by_outage, self.hours, self.histogram = empty.by_outage, empty.hours, empty.histogram
@@ -200,9 +200,9 @@ class MethodRun:
 
     # -- results -------------------------------------------------------------------------------------------
 
-    def sums(self) -> Sums:
+    def sums(self) -> MethodSums:
         """Return what the mirrors have added up to so far."""
-        return Sums(
+        return MethodSums(
             total=read_only(self.total),
             by_mode=read_only(self.by_mode),
             by_outage=read_only(self.by_outage[:, : self._n_outage]),

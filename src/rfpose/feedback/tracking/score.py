@@ -12,7 +12,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.energy import Bursts, response_loss
 from rfpose.feedback.fieldcontrol.modes import Mode
 from rfpose.feedback.tracking import _kernels as kernels
-from rfpose.feedback.tracking.run import Sums
+from rfpose.feedback.tracking.run import MethodSums
 
 __all__ = ["Score", "score"]
 
@@ -145,7 +145,7 @@ class Score:
         }
 
 
-def score(sums: Sums) -> Score:
+def score(sums: MethodSums) -> Score:
     """Return a method's score."""
     total = sums.total
     n_day, n_mirror = total.shape[:2]

@@ -20,10 +20,10 @@ from rfpose.feedback.tracking.methods import choose
 from rfpose.feedback.tracking.operation import who_of
 from rfpose.feedback.tracking.plant import Plant
 from rfpose.feedback.tracking.radio import RadioByPosture
-from rfpose.feedback.tracking.run import Curves, Kept, MethodRun, Segment, Sums
+from rfpose.feedback.tracking.run import Curves, KeptCourses, MethodRun, MethodSums, Segment
 from rfpose.scenario import Scenario
 
-__all__ = ["Curves", "Sums", "TrackingSimulation"]
+__all__ = ["Curves", "MethodSums", "TrackingSimulation"]
 
 SEGMENT_S = 900.0
 """Simulated time between two points at which a run can be taken up again."""
@@ -74,7 +74,7 @@ class TrackingSimulation:
             for event in plan.event:  # refuse names that nobody has before days go by
                 who_of(event, self.field, plan.field_control.bus.cluster_size)
         calibrator = Calibrator(self.plant, self.radio)
-        kept = Kept(stored=self.stored, stride=self._stride)
+        kept = KeptCourses(stored=self.stored, stride=self._stride)
         self._runs = {m.name: MethodRun(m, self.plant, calibrator, kept) for m in self.methods}
         self._gust_state = self.plant.gusts.process.start(generator(self.plant.seed, 1, 0), n)
         self._beside = ThreadPoolExecutor(1, "rfpose-wind")
@@ -176,7 +176,7 @@ class TrackingSimulation:
 
     # -- results -------------------------------------------------------------------------------------------
 
-    def sums(self, name: str) -> Sums:
+    def sums(self, name: str) -> MethodSums:
         """Return what a method's mirrors have added up to so far."""
         return self._runs[name].sums()
 

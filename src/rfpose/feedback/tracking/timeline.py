@@ -13,7 +13,7 @@ from rfpose.errors import ScenarioError
 from rfpose.feedback.energy import clear_beam_w_m2
 from rfpose.scenario import Scenario
 from rfpose.scenario.tracking import Tracking
-from rfpose.sun import Site, sun_position
+from rfpose.sun import Location, sun_position
 
 __all__ = ["Day", "day_of", "days", "heat_of", "hour_of_day", "look_times", "site_of", "ways_s"]
 
@@ -60,7 +60,7 @@ class Day:
         return heat_of(self.hour)
 
 
-def site_of(scenario: Scenario) -> Site:
+def site_of(scenario: Scenario) -> Location:
     """Return where the field is.
 
     Raises
@@ -71,14 +71,14 @@ def site_of(scenario: Scenario) -> Site:
     place = scenario.site
     if place.latitude_deg is None or place.longitude_deg is None:
         raise ScenarioError("[site] `latitude_deg` and `longitude_deg` are missing: they place the sun; add them")
-    return Site(
+    return Location(
         latitude_rad=float(np.deg2rad(place.latitude_deg)),
         longitude_rad=float(np.deg2rad(place.longitude_deg)),
         altitude_m=place.height_m,
     )
 
 
-def hour_of_day(unix_s: npt.ArrayLike, site: Site) -> FloatArray:
+def hour_of_day(unix_s: npt.ArrayLike, site: Location) -> FloatArray:
     """Return local mean solar time [h]."""
     return np.asarray(np.mod(np.asarray(unix_s) / 3600.0 + np.rad2deg(site.longitude_rad) / 15.0, 24.0))
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
-from rfpose.feedback.structure import Structure, swing_transition
+from rfpose.feedback.structure import StructureMode, swing_transition
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.feedback.wind.gusts import gust_process
 from rfpose.feedback.wind.record import WindRecord, read_wind_csv
@@ -23,10 +23,10 @@ _BLOCK = 2000
 """Mirrors drawn at a time, to bound the memory."""
 
 
-def structure_of(scenario: Scenario) -> Structure | None:
+def structure_of(scenario: Scenario) -> StructureMode | None:
     """Return what lies between drive and mirror; None: nothing that swings."""
     mode = scenario.tracking.structure
-    return Structure(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None
+    return StructureMode(natural_hz=mode.natural_hz, damping=mode.damping) if mode.natural_hz > 0.0 else None
 
 
 class Gusts:
@@ -71,7 +71,7 @@ class Gusts:
         if mode is not None:
             self._structure(plan, mode)
 
-    def _structure(self, plan: Tracking, mode: Structure) -> None:
+    def _structure(self, plan: Tracking, mode: StructureMode) -> None:
         self.transition, self.root = swing_transition(mode, interval_s=plan.servo_interval_s)
         if self.mean_mps > 0.0:
             size_m = float(np.sqrt(plan.mirror_area_m2))

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.structure import AIR_KG_M3, Structure, deflect
+from rfpose.feedback.structure import AIR_KG_M3, StructureMode, deflect
 
 __all__ = ["WindLoad", "wind_bend"]
 
@@ -60,7 +60,7 @@ def wind_bend(
     deflection_1mps_rad: float,
     speed_mps: npt.ArrayLike,
     *,
-    structure: Structure | None = None,
+    structure: StructureMode | None = None,
     interval_s: float = 1.0,
 ) -> FloatArray:
     """Return what a wind record bends a mirror by.

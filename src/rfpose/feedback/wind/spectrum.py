@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.structure import Structure
+from rfpose.feedback.structure import StructureMode
 
 __all__ = [
     "MEAN_WIND_MPS",
@@ -85,7 +85,7 @@ def perfect_servo(bandwidth_hz: float) -> Residual:
 def wind_deflection(
     deflection_1mps_rad: float,
     speed_mps: npt.ArrayLike,
-    structure: Structure,
+    structure: StructureMode,
     *,
     size_m: float,
     residual: Residual | None = None,
@@ -129,7 +129,7 @@ def wind_deflection(
 
 def sunshine_deflection(
     deflection_1mps_rad: float,
-    structure: Structure,
+    structure: StructureMode,
     *,
     size_m: float,
     residual: Residual | None = None,
@@ -155,7 +155,7 @@ def sunshine_deflection(
 
 
 def rigidity_gain(
-    structure: Structure,
+    structure: StructureMode,
     residual: Residual,
     *,
     size_m: float,

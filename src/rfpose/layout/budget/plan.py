@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.layout.gain import Gain, Reflection, normal_gain
-from rfpose.layout.maps import Mirrors, check_site
+from rfpose.layout.gain import Gain, ReflectionBend, normal_gain
+from rfpose.layout.maps import PosedMirrors, check_site
 from rfpose.measurement import (
     Estimator,
     GroundHandling,
@@ -65,7 +65,7 @@ class WorkingPoint:
     """
 
     scenario: Scenario
-    mirrors: Mirrors
+    mirrors: PosedMirrors
     estimator: Estimator
     ground: GroundHandling
     waves: Wavelengths
@@ -184,7 +184,9 @@ class WorkingPoint:
         reflection = None
         if self.reflects:
             direct = _directions(self.scenario.transmitter_enu_m, self.mirrors.receiver_enu_m)
-            reflection = Reflection(place_slope=self.by_place - direct[:, None], shared_slope=self._coefficient_slope())
+            reflection = ReflectionBend(
+                place_slope=self.by_place - direct[:, None], shared_slope=self._coefficient_slope()
+            )
         return normal_gain(
             self.scenario.transmitter_enu_m,
             self.mirrors,
@@ -221,7 +223,7 @@ class WorkingPoint:
         return np.zeros((*self.thermal_m.shape, 0))
 
 
-def working_point(scenario: Scenario, mirrors: Mirrors, *, pose: str = "rigid") -> WorkingPoint:
+def working_point(scenario: Scenario, mirrors: PosedMirrors, *, pose: str = "rigid") -> WorkingPoint:
     """Return the working point of a scenario's budget.
 
     Finer tones and the carrier take part where the solver would trust their whole wavelengths on every mirror.

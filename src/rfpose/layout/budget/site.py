@@ -18,17 +18,17 @@ from rfpose.checks import FloatArray
 from rfpose.engine import gathered
 from rfpose.errors import InvalidInputError
 from rfpose.layout.budget.sources import (
+    MirrorMotion,
     Misalignment,
-    Motion,
     Quantisation,
-    ReceiverPlaces,
+    ReceiverPlacement,
     Thermal,
     TransmitterSurvey,
     Wavelength,
 )
-from rfpose.layout.budget.table import Draws, ErrorBudget, budget_line, target_slope, worst_first
-from rfpose.layout.maps import Mirrors
-from rfpose.multilat.site import Disturbance, ForeseenMirrors
+from rfpose.layout.budget.table import ErrorBudget, LineDraws, budget_line, target_slope, worst_first
+from rfpose.layout.maps import PosedMirrors
+from rfpose.multilat.site import ForeseenMirrors, WorldErrors
 from rfpose.scenario import Scenario
 
 __all__ = ["SiteMirrors", "SitePlan", "site_budget"]
@@ -64,7 +64,7 @@ class SitePlan:
     """
 
     scenario: Scenario
-    mirrors: Mirrors
+    mirrors: PosedMirrors
     parts: tuple[SiteMirrors, ...]
     converter_share: float
 
@@ -77,7 +77,7 @@ class _Line:
     remedy: str
     assumed: Callable[[SitePlan], str]
     share: Callable[[SitePlan, ForeseenMirrors], FloatArray]
-    draw: Callable[[SitePlan, ForeseenMirrors, np.random.Generator], Disturbance | FloatArray]
+    draw: Callable[[SitePlan, ForeseenMirrors, np.random.Generator], WorldErrors | FloatArray]
     """What the world has more; or what the normals (mirror, xyz) are off by past the estimator."""
 
 
@@ -112,7 +112,7 @@ def site_budget(
     found = [(line, cov) for line, cov, present in zip(asked, first_order, there, strict=True) if present]
     streams = np.random.SeedSequence(seed).spawn(len(_LINES) + 1)
     places = [_LINES.index(line) for line, _ in found]
-    draws = [Draws((k,), n_draw, streams[k]) for k in places] + [Draws(tuple(places), n_draw, streams[-1])]
+    draws = [LineDraws((k,), n_draw, streams[k]) for k in places] + [LineDraws(tuple(places), n_draw, streams[-1])]
     *each, (together, failed) = gathered(_drawn, draws, plan, progress)
     lines = []
     for (line, cov), (drawn, failed_alone) in zip(found, each, strict=True):
@@ -138,7 +138,7 @@ def _of_rows(plan: SitePlan, line: _Line) -> FloatArray:
     return out
 
 
-def _drawn(plan: SitePlan, wanted: Draws) -> tuple[FloatArray, int]:
+def _drawn(plan: SitePlan, wanted: LineDraws) -> tuple[FloatArray, int]:
     """(mirror, 2, 2) mean square of the normal's error through the fit, NaN without draws; failed solutions."""
     n = len(plan.mirrors.pivot_enu_m)
     total, count = np.zeros((n, 2, 2)), np.zeros(n)
@@ -160,10 +160,10 @@ def _one_draw(
     plan: SitePlan, lines: Sequence[_Line], foreseen: ForeseenMirrors, rng: np.random.Generator
 ) -> FloatArray:
     """(mirror, xyz) solved less true normals."""
-    world, past = Disturbance(), np.zeros((len(foreseen.sigma), 3))
+    world, past = WorldErrors(), np.zeros((len(foreseen.sigma), 3))
     for line in lines:
         drawn = line.draw(plan, foreseen, rng)
-        if isinstance(drawn, Disturbance):
+        if isinstance(drawn, WorldErrors):
             world = world + drawn
         else:
             past += drawn
@@ -231,12 +231,12 @@ def _clock(plan: SitePlan) -> str:
 # -- what it does not reckon with --------------------------------------------------------------------------------------
 
 
-def _draw_quantisation(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
+def _draw_quantisation(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> WorldErrors:
     drawn = part.drawn("noise", rng)
-    return Disturbance(stray=np.sqrt(plan.converter_share) * drawn.stray)
+    return WorldErrors(stray=np.sqrt(plan.converter_share) * drawn.stray)
 
 
-def _through(part: ForeseenMirrors, worlds: Iterable[Disturbance], times: float) -> FloatArray:
+def _through(part: ForeseenMirrors, worlds: Iterable[WorldErrors], times: float) -> FloatArray:
     """(mirror, xyz, xyz) sum of squares of what small disturbances do, each so many times as large."""
     change = times * np.array([part.normal_change(world, linear=True) for world in worlds])
     return np.asarray(np.einsum("dmx,dmy->mxy", change, change))
@@ -246,33 +246,33 @@ def _share_places(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
     _, n_receiver, _ = part.sigma.shape
     steps = _STEP_M * np.eye(3 * n_receiver).reshape(-1, n_receiver, 3)
     return _through(
-        part, (Disturbance(place_m=step) for step in steps), plan.scenario.budget.receiver_mirror_sigma_m / _STEP_M
+        part, (WorldErrors(place_m=step) for step in steps), plan.scenario.budget.receiver_mirror_sigma_m / _STEP_M
     )
 
 
-def _draw_places(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
+def _draw_places(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> WorldErrors:
     sigma = plan.scenario.budget.receiver_mirror_sigma_m
-    return Disturbance(place_m=sigma * rng.standard_normal((*part.sigma.shape[:2], 3)))
+    return WorldErrors(place_m=sigma * rng.standard_normal((*part.sigma.shape[:2], 3)))
 
 
 def _share_transmitters(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
     n_transmitter = part.sigma.shape[2]
     steps = _STEP_M * np.eye(3 * n_transmitter).reshape(-1, n_transmitter, 3)
     sigma_m = plan.scenario.budget.transmitter_survey_sigma_m
-    return _through(part, (Disturbance(transmitter_m=step) for step in steps), sigma_m / _STEP_M)
+    return _through(part, (WorldErrors(transmitter_m=step) for step in steps), sigma_m / _STEP_M)
 
 
-def _draw_transmitters(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
+def _draw_transmitters(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> WorldErrors:
     sigma = plan.scenario.budget.transmitter_survey_sigma_m
-    return Disturbance(transmitter_m=sigma * rng.standard_normal((part.sigma.shape[2], 3)))
+    return WorldErrors(transmitter_m=sigma * rng.standard_normal((part.sigma.shape[2], 3)))
 
 
 def _share_air(plan: SitePlan, part: ForeseenMirrors) -> FloatArray:
-    return _through(part, [Disturbance(range_scale=_STEP_SHARE)], Wavelength().sigma(plan) / _STEP_SHARE)
+    return _through(part, [WorldErrors(range_scale=_STEP_SHARE)], Wavelength().sigma(plan) / _STEP_SHARE)
 
 
-def _draw_air(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> Disturbance:
-    return Disturbance(range_scale=Wavelength().sigma(plan) * float(rng.standard_normal()))
+def _draw_air(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> WorldErrors:
+    return WorldErrors(range_scale=Wavelength().sigma(plan) * float(rng.standard_normal()))
 
 
 def _across(part: ForeseenMirrors) -> FloatArray:
@@ -291,7 +291,7 @@ def _draw_tilt(part: ForeseenMirrors, rng: np.random.Generator, sigma_rad: float
 
 
 def _draw_motion(plan: SitePlan, part: ForeseenMirrors, rng: np.random.Generator) -> FloatArray:
-    return _draw_tilt(part, rng, Motion().angle_rad(plan) / np.sqrt(2.0))
+    return _draw_tilt(part, rng, MirrorMotion().angle_rad(plan) / np.sqrt(2.0))
 
 
 _LINES: tuple[_Line, ...] = (
@@ -328,9 +328,9 @@ _LINES: tuple[_Line, ...] = (
         share=lambda plan, part: plan.converter_share * part.share("noise"), draw=_draw_quantisation,
     ),
     _Line(
-        name=ReceiverPlaces.name,
+        name=ReceiverPlacement.name,
         remedy="`rfpose survey` with reference poses of a camera; measure the receivers on the mirror better",
-        assumed=ReceiverPlaces().assumed, share=_share_places, draw=_draw_places,
+        assumed=ReceiverPlacement().assumed, share=_share_places, draw=_draw_places,
     ),
     _Line(
         name=TransmitterSurvey.name, remedy=TransmitterSurvey.remedy, assumed=TransmitterSurvey().assumed,
@@ -342,8 +342,8 @@ _LINES: tuple[_Line, ...] = (
         draw=lambda plan, part, rng: _draw_tilt(part, rng, _glass_rad(plan)),
     ),
     _Line(
-        name=Motion.name, remedy=Motion.remedy, assumed=Motion().assumed,
-        share=lambda plan, part: 0.5 * Motion().angle_rad(plan) ** 2 * _across(part), draw=_draw_motion,
+        name=MirrorMotion.name, remedy=MirrorMotion.remedy, assumed=MirrorMotion().assumed,
+        share=lambda plan, part: 0.5 * MirrorMotion().angle_rad(plan) ** 2 * _across(part), draw=_draw_motion,
     ),
     _Line(
         name=Wavelength.name, remedy=Wavelength.remedy, assumed=Wavelength().assumed,

@@ -38,7 +38,7 @@ class Effect:
     past_solver: bool = False
 
 
-class Described(Protocol):
+class DescribedPoint(Protocol):
     """A working point of any estimator, as far as its site says it all."""
 
     @property
@@ -92,7 +92,7 @@ class Thermal:
     name = "thermal noise"
     remedy = "longer frames or several of them (error falls as 1/√time), more power, a shorter wavelength"
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         s = plan.scenario
         return f"{s.simulation.tone_snr_db:g} dB a sample, {s.radio.frame_samples} samples"
 
@@ -109,7 +109,7 @@ class Quantisation:
     name = "quantisation"
     remedy = "more converter bits, less headroom, longer frames"
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         if plan.converter_share == 0.0:
             return ""
         return f"{plan.scenario.simulation.adc_bits} bits, {plan.scenario.simulation.headroom_db:g} dB headroom"
@@ -196,7 +196,7 @@ class TransmitterSurvey:
     name = "transmitter survey"
     remedy = "survey the antennas better, or solve for them from many mirrors' poses"
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         sigma_mm = 1e3 * plan.scenario.budget.transmitter_survey_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
@@ -215,7 +215,7 @@ class TransmitterSurvey:
         world.transmitter_enu_m += sigma * world.normal(*world.transmitter_enu_m.shape)
 
 
-class Drift:
+class TransmitterDrift:
     """Electronic phases of the transmitters since their calibration."""
 
     name = "phase drift"
@@ -250,13 +250,13 @@ class Drift:
         world.range_m[:, :, : world.plan.waves.n_tone] += drift[:, None, :, None]
 
 
-class ReceiverPlaces:
+class ReceiverPlacement:
     """Places of the receivers on their mirror."""
 
     name = "receiver places"
     remedy = "measure the receivers on the mirror better, set them farther apart; constant, so calibration takes it out"
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         sigma_mm = 1e3 * plan.scenario.budget.receiver_mirror_sigma_m
         return f"{sigma_mm:.3g} mm in each axis" if sigma_mm > 0.0 else ""
 
@@ -276,7 +276,7 @@ class Misalignment:
     name = "receiver plane to glass"
     remedy = "calibrate against a camera or the sun once; constant for a mirror"
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         sigma = plan.scenario.budget.receiver_plane_sigma_mrad
         return f"{sigma:.3g} mrad about each axis" if sigma > 0.0 else ""
 
@@ -356,7 +356,7 @@ class GroundReflection:
             world.coefficient += re + 1j * im
 
 
-class Reflections:
+class ForeseenReflections:
     """Rays off neighbours, the tower and the mirror's own plate, foreseen from their geometry."""
 
     name = "reflections of the site"
@@ -383,7 +383,7 @@ class Reflections:
         world.calibration_m += plan.calibration_stray_m
 
 
-class Multipath:
+class StrayRay:
     """One stray ray for every receiver and transmitter, of random phase and detour."""
 
     name = "other multipath"
@@ -455,19 +455,19 @@ def _stray_m(world: DrawnSites, a: float, excess_m: float, shape: tuple[int, ...
     return np.stack(out, axis=2)
 
 
-class Motion:
+class MirrorMotion:
     """The mirror's turn between the frame's middle, which its phases show, and the instant the pose is taken for."""
 
     name = "motion in a frame"
     remedy = "shorter frames, or predict the pose from the drive's rate"
 
-    def angle_rad(self, plan: Described) -> float:
+    def angle_rad(self, plan: DescribedPoint) -> float:
         """Return by how much the normal turns."""
         s = plan.scenario
         frame_s = s.radio.frame_samples / s.radio.sample_rate_hz
         return 1e-3 * s.budget.mirror_rate_mrad_per_s * (0.5 * frame_s + s.budget.latency_s)
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         rate, latency = plan.scenario.budget.mirror_rate_mrad_per_s, plan.scenario.budget.latency_s
         if rate == 0.0:
             return ""
@@ -491,13 +491,13 @@ class Wavelength:
     name = "wavelength (air)"
     remedy = "set `propagation_speed_mps` to that of the site's air, from temperature, pressure and humidity"
 
-    def sigma(self, plan: Described) -> float:
+    def sigma(self, plan: DescribedPoint) -> float:
         """Return the relative error of all ranges."""
         stated = plan.scenario.budget.refractivity_sigma_ppm
         vacuum = plan.scenario.radio.propagation_speed_mps == 299_792_458.0
         return 1e-6 * ((300.0 if vacuum else 20.0) if stated is None else stated)
 
-    def assumed(self, plan: Described) -> str:
+    def assumed(self, plan: DescribedPoint) -> str:
         sigma = self.sigma(plan)
         return f"refractive index to {1e6 * sigma:g} ppm" if sigma > 0.0 else ""
 
@@ -523,14 +523,14 @@ SOURCES: tuple[Source, ...] = (
     CalibrationNoise(),
     CalibrationSurvey(),
     TransmitterSurvey(),
-    Drift(),
-    ReceiverPlaces(),
+    TransmitterDrift(),
+    ReceiverPlacement(),
     Misalignment(),
     Pivot(),
     GroundReflection(),
-    Reflections(),
-    Multipath(),
-    Motion(),
+    ForeseenReflections(),
+    StrayRay(),
+    MirrorMotion(),
     Wavelength(),
 )
 """All sources, in the order in which they are asked."""

@@ -15,7 +15,7 @@ from rfpose.layout.budget.plan import WorkingPoint
 from rfpose.layout.budget.sources import SOURCES, Effect
 from rfpose.layout.budget.world import DrawnSites
 from rfpose.layout.gain import Gain
-from rfpose.layout.maps import Mirrors
+from rfpose.layout.maps import PosedMirrors
 
 __all__ = ["BudgetLine", "ErrorBudget", "error_budget", "noise_bound", "target_slope"]
 
@@ -111,7 +111,7 @@ def error_budget(
     to_target = target_slope(plan.mirrors, aim_enu_m)
     there = [k for k, source in enumerate(SOURCES) if source.assumed(plan)]
     streams = np.random.SeedSequence(seed).spawn(len(SOURCES) + 1)
-    draws = [Draws((k,), n_draw, streams[k]) for k in there] + [Draws(tuple(there), n_draw, streams[-1])]
+    draws = [LineDraws((k,), n_draw, streams[k]) for k in there] + [LineDraws(tuple(there), n_draw, streams[-1])]
     *each, (together, failed) = gathered(_draw, draws, plan, progress)
     lines, total = [], np.zeros((len(plan.mirrors.pivot_enu_m), 2, 2))
     for k, (drawn, failed_alone) in zip(there, each, strict=True):
@@ -139,7 +139,7 @@ def noise_bound(plan: WorkingPoint) -> FloatArray:
     return np.asarray(np.sqrt(np.trace(plan.gain().cov, axis1=1, axis2=2)))
 
 
-def target_slope(mirrors: Mirrors, aim_enu_m: npt.ArrayLike | None) -> FloatArray:
+def target_slope(mirrors: PosedMirrors, aim_enu_m: npt.ArrayLike | None) -> FloatArray:
     """Return (mirror, xyz, xy): where the beam meets the target, by the normal's error along the mirror's axes [m/rad].
 
     The beam to the aim point turns by 2 (n·s) δn + 2 (δn·s) n, s towards the sun: twice δn in the plane of incidence,
@@ -191,7 +191,7 @@ def _covariance(effects: Sequence[Effect], gain: Gain) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class LineDraws:
     """A line's share of the Monte Carlo."""
 
     lines: tuple[int, ...]
@@ -200,7 +200,7 @@ class Draws:
     stream: np.random.SeedSequence
 
 
-def _draw(plan: WorkingPoint, wanted: Draws) -> tuple[FloatArray, int]:
+def _draw(plan: WorkingPoint, wanted: LineDraws) -> tuple[FloatArray, int]:
     """(mirror, 2, 2) mean square of the normal's error through the solver, NaN without draws; failed solutions."""
     n_mirror = len(plan.mirrors.pivot_enu_m)
     total, count = np.zeros((n_mirror, 2, 2)), np.zeros(n_mirror)

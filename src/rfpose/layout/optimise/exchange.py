@@ -15,9 +15,17 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.layout.maps import Mirrors
+from rfpose.layout.maps import PosedMirrors
 from rfpose.layout.optimise.rules import Constraints, Costs
-from rfpose.layout.optimise.search import FEASIBLE, Placement, Problem, Progress, draw_places, problem_of, statistic_of
+from rfpose.layout.optimise.search import (
+    FEASIBLE,
+    Placement,
+    Progress,
+    TowerProblem,
+    draw_places,
+    problem_of,
+    statistic_of,
+)
 
 __all__ = ["Measure", "exchange", "measured"]
 
@@ -40,7 +48,7 @@ def measured(measure: Measure, transmitter_enu_m: npt.ArrayLike, statistic: str)
 def exchange(
     begin: Placement,
     measure: Measure,
-    field: Mirrors,
+    field: PosedMirrors,
     constraints: Constraints,
     *,
     criterion: str,
@@ -118,7 +126,7 @@ def exchange(
     )
 
 
-def _meets(problem: Problem, site: FloatArray) -> bool:
+def _meets(problem: TowerProblem, site: FloatArray) -> bool:
     """Return whether the new towers of a site meet the constraints."""
     low, high = problem.constraints.height_m
     new = site[len(problem.existing) :]
@@ -128,7 +136,7 @@ def _meets(problem: Problem, site: FloatArray) -> bool:
 
 
 def _other_places(
-    problem: Problem, site: FloatArray, tower: int, tries: int, near: float, rng: np.random.Generator
+    problem: TowerProblem, site: FloatArray, tower: int, tries: int, near: float, rng: np.random.Generator
 ) -> FloatArray:
     """(place, xyz) where a tower could stand, the others staying."""
     others = np.delete(site, tower, axis=0)

@@ -15,7 +15,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.engine import gathered
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.jit import one_thread
-from rfpose.layout.maps import Mirrors, kernel_field, plane_slope
+from rfpose.layout.maps import PosedMirrors, kernel_field, plane_slope
 from rfpose.layout.optimise import _kernels
 from rfpose.layout.optimise.rules import Constraints, Costs
 
@@ -78,10 +78,10 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class TowerProblem:
     """Objective and constraints over the flat, scaled coordinates of the new towers."""
 
-    field: Mirrors
+    field: PosedMirrors
     criterion: Criterion
     statistic: str
     sigma_m: float
@@ -170,7 +170,7 @@ class Problem:
 
 
 def _rows(
-    transmitter: FloatArray, field: Mirrors, criterion: Criterion, sigma_m: float
+    transmitter: FloatArray, field: PosedMirrors, criterion: Criterion, sigma_m: float
 ) -> tuple[FloatArray, FloatArray]:
     """Variance at each field point (point,) and its slope (point, transmitter, xyz)."""
     n = len(field.pivot_enu_m)
@@ -216,7 +216,7 @@ def statistic_of(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple
 
 def evaluate_placement(
     transmitter_enu_m: npt.ArrayLike,
-    field: Mirrors,
+    field: PosedMirrors,
     *,
     criterion: Criterion = "pdop",
     statistic: str = "rms",
@@ -234,7 +234,7 @@ def evaluate_placement(
 
 def optimise(
     n_transmitter: int,
-    field: Mirrors,
+    field: PosedMirrors,
     constraints: Constraints,
     *,
     criterion: Criterion = "pdop",
@@ -316,12 +316,17 @@ def optimise(
 
 
 def problem_of(
-    field: Mirrors, criterion: Criterion, statistic: str, sigma_m: float, existing: FloatArray, constraints: Constraints
-) -> Problem:
+    field: PosedMirrors,
+    criterion: Criterion,
+    statistic: str,
+    sigma_m: float,
+    existing: FloatArray,
+    constraints: Constraints,
+) -> TowerProblem:
     from scipy.spatial import KDTree
 
     corners = np.vstack([corner for zone in constraints.allowed for corner in zone.box])
-    return Problem(
+    return TowerProblem(
         field, criterion, statistic, sigma_m, existing, constraints,
         scale=max(float(np.ptp(corners, axis=0).max()), 1e-9),
         heliostats=KDTree(field.pivot_enu_m[:, :2]) if constraints.clearance_m > 0.0 else None,
@@ -341,7 +346,7 @@ def _check(criterion: str, statistic: str) -> None:
         raise InvalidInputError(f"`statistic` must be rms, worst or a percentile such as p95, got {statistic!r}")
 
 
-def draw_places(problem: Problem, n_new: int, rng: np.random.Generator) -> FloatArray:
+def draw_places(problem: TowerProblem, n_new: int, rng: np.random.Generator) -> FloatArray:
     """Random places (new transmitter, xyz) that meet the constraints, one tower after the other."""
     rules = problem.constraints
     boxes = np.array([zone.box for zone in rules.allowed])
@@ -367,14 +372,14 @@ def draw_places(problem: Problem, n_new: int, rng: np.random.Generator) -> Float
     )
 
 
-def _searched(problem: Problem, start: FloatArray) -> tuple[float, FloatArray | None]:
+def _searched(problem: TowerProblem, start: FloatArray) -> tuple[float, FloatArray | None]:
     """Return what the search from one start comes to, and where it ends; NaN and None where that is nowhere."""
     with _one_thread() if len(problem.field.pivot_enu_m) < _FEW_POINTS else contextlib.nullcontext():
         end = _search(problem, start)
         return (np.nan, None) if end is None else (_value(problem, end), end)
 
 
-def _search(problem: Problem, start: FloatArray) -> FloatArray | None:
+def _search(problem: TowerProblem, start: FloatArray) -> FloatArray | None:
     """SLSQP from one start; None where it ends outside the constraints."""
     n = len(start)
     low, high = (h / problem.scale for h in problem.constraints.height_m)
@@ -397,7 +402,7 @@ def _search(problem: Problem, start: FloatArray) -> FloatArray | None:
     return x
 
 
-def _value(problem: Problem, x: FloatArray) -> float:
+def _value(problem: TowerProblem, x: FloatArray) -> float:
     return evaluate_placement(
         problem.site(x),
         problem.field,
@@ -407,7 +412,7 @@ def _value(problem: Problem, x: FloatArray) -> float:
     )
 
 
-def _without_worst(problem: Problem, site: FloatArray) -> float:
+def _without_worst(problem: TowerProblem, site: FloatArray) -> float:
     if len(site) <= 5:
         return float("nan")
     return float(

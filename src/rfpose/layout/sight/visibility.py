@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import unit
-from rfpose.layout.maps import Mirrors
+from rfpose.layout.maps import PosedMirrors
 from rfpose.layout.sight import _kernels
 
 __all__ = ["Plates", "Tower", "discs_lit", "lit_share", "visible"]
@@ -77,7 +77,7 @@ class Tower:
 
 
 def visible(
-    transmitter_enu_m: npt.ArrayLike, mirrors: Mirrors, plates: Plates, *, tower: Tower | None = None
+    transmitter_enu_m: npt.ArrayLike, mirrors: PosedMirrors, plates: Plates, *, tower: Tower | None = None
 ) -> npt.NDArray[np.bool_]:
     """Return which transmitters each receiver sees (mirror, receiver, transmitter), by straight rays.
 
@@ -100,7 +100,7 @@ def visible(
 
 
 def lit_share(
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     plates: Plates,
     *,
     sun_enu: npt.ArrayLike,
@@ -170,7 +170,7 @@ def _free(
     source_enu_m: FloatArray,
     place_enu_m: FloatArray,
     who: npt.NDArray[np.int64],
-    mirrors: Mirrors,
+    mirrors: PosedMirrors,
     plates: Plates,
     tower: Tower | None,
 ) -> npt.NDArray[np.bool_]:
@@ -194,7 +194,7 @@ def _free(
     return out.astype(np.bool_)
 
 
-def _lifted(mirrors: Mirrors, plates: Plates) -> FloatArray:
+def _lifted(mirrors: PosedMirrors, plates: Plates) -> FloatArray:
     """(mirror, receiver, xyz) places of the receivers, those within a plate a hair's breadth out of it [m]."""
     hair = _HAIR * float(np.hypot(plates.width_m, plates.height_m))
     place = mirrors.receiver_mirror_m

@@ -1,5 +1,5 @@
 """The equations of rigid mirrors, which all their solvers share."""
 
-from rfpose.multilat.equations._kernels import Mirrors, Prior, rotate
+from rfpose.multilat.equations._kernels import MirrorArrays, MirrorPrior, rotate
 
-__all__ = ["Mirrors", "Prior", "rotate"]
+__all__ = ["MirrorArrays", "MirrorPrior", "rotate"]

@@ -23,7 +23,7 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
 
-class Prior(NamedTuple):
+class MirrorPrior(NamedTuple):
     """What is known of mirrors beforehand, as information (1/σ²); mirror is the first axis.
 
     ``pivot``, ``pivot_info`` (mirror, 3, 3): surveys; ``roll_info`` (mirror,): a mount keeps the x axis horizontal;
@@ -39,7 +39,7 @@ class Prior(NamedTuple):
     clock: Float64
 
 
-class Mirrors(NamedTuple):
+class MirrorArrays(NamedTuple):
     """Measurements of many mirrors and what is known of them, as kernels take them; mirror is the first axis.
 
     ``receiver_mirror`` (mirror, receiver, 3) in the mirror frame; ``z``, ``weight`` (mirror, group, receiver,
@@ -52,13 +52,13 @@ class Mirrors(NamedTuple):
     weight: Float64
     bias_info: Float64
     clock_class: Int64
-    prior: Prior
+    prior: MirrorPrior
     frame: Int64
 
-    def take(self, rows: Int64) -> Mirrors:
+    def take(self, rows: Int64) -> MirrorArrays:
         """Select mirrors."""
         own = {name: getattr(self, name)[rows] for name in self._fields if name not in ("clock_class", "prior")}
-        return self._replace(**own, prior=Prior(*(array[rows] for array in self.prior)))
+        return self._replace(**own, prior=MirrorPrior(*(array[rows] for array in self.prior)))
 
 
 @kernel

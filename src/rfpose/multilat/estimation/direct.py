@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.estimation.found import (
     RESIDUAL_PROBABILITY,
-    Found,
+    PoseEstimates,
     are_doubted,
     joined,
     put_rows,
@@ -33,7 +33,7 @@ def solve_direct(
     problem: MirrorProblem,
     alarms: Alarms | None,
     again: Iterable[tuple[npt.NDArray[np.int64], MirrorProblem]] = (),
-) -> Found:
+) -> PoseEstimates:
     """Solve by the direct ray: leave out what is wrong in the coarsest tone, climb, test all wavelengths together.
 
     Parameters
@@ -51,7 +51,7 @@ def solve_direct(
     return found
 
 
-def _decided(found: Found, rows: npt.NDArray[np.int64], other: Found) -> Found:
+def _decided(found: PoseEstimates, rows: npt.NDArray[np.int64], other: PoseEstimates) -> PoseEstimates:
     """Keep the better of two poses of some mirrors; where neither is clearly better, say so."""
     doubted = (PoseStatus.OK, PoseStatus.AMBIGUOUS)
     here, there = np.isin(found.status[rows], doubted), other.status == PoseStatus.OK
@@ -71,7 +71,7 @@ def _decided(found: Found, rows: npt.NDArray[np.int64], other: Found) -> Found:
     return replace(put_rows(found, rows[better], other, better), status=status)
 
 
-def _cost(found: Found) -> FloatArray:
+def _cost(found: PoseEstimates) -> FloatArray:
     """(mirror,) how badly a pose fits: what was left out for it counts, lest it fits by leaving out."""
     poses = found.poses
     cost = poses.chi2 - poses.dof
@@ -81,7 +81,7 @@ def _cost(found: Found) -> FloatArray:
     return np.asarray(cost)
 
 
-def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> Found:
+def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> PoseEstimates:
     """Solve from where mirrors begin."""
     first: GuardedPoses | None = None
     used = problem
@@ -90,7 +90,7 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> Found:
         used = problem.only(first.used)
     ladder = solve_ladder(used)
     resolved = replace(used, range_m=ladder.range_m)
-    found = Found(
+    found = PoseEstimates(
         poses=ladder.poses,
         status=ladder.poses.status.copy(),
         fixed=ladder.fixed,

@@ -17,7 +17,7 @@ from rfpose.multilat.status import PoseStatus
 
 __all__ = [
     "RESIDUAL_PROBABILITY",
-    "Found",
+    "PoseEstimates",
     "are_doubted",
     "joined",
     "protected",
@@ -34,7 +34,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
+class PoseEstimates:
     """Poses of mirrors, and how they came about; None where an estimator does not look for it.
 
     Attributes
@@ -80,7 +80,7 @@ def residual_probability(poses: RigidPoses) -> FloatArray:
         return np.asarray(chdtrc(np.maximum(poses.dof, 1.0), poses.chi2))
 
 
-def protected(found: Found, missed: float) -> Found:
+def protected(found: PoseEstimates, missed: float) -> PoseEstimates:
     """Let covariances say what protection levels do, where something was left out; ``missed`` is theirs."""
     guard = found.guard
     if guard is None:
@@ -94,7 +94,7 @@ def _left_out(guard: GuardedPoses) -> BoolArray:
     return np.asarray(excluded | guard.prior_rejected.any(axis=1))
 
 
-def without_vague(found: Found) -> Found:
+def without_vague(found: PoseEstimates) -> PoseEstimates:
     """Mark poses that tell less of the normal than would make them solved."""
     vague = ~(found.poses.tilt_sigma_rad <= MAX_SIGMA_RAD)
     return replace(found, status=np.where((found.status == PoseStatus.OK) & vague, PoseStatus.UNCERTAIN, found.status))
@@ -106,9 +106,9 @@ def are_doubted(guard: GuardedPoses) -> BoolArray:
     return np.asarray((guard.status == IntegrityStatus.UNEXPLAINED) | unconfirmed)
 
 
-def put_rows(first: Found, rows: IntArray, second: Found, those: IntArray) -> Found:
+def put_rows(first: PoseEstimates, rows: IntArray, second: PoseEstimates, those: IntArray) -> PoseEstimates:
     """Return poses with some mirrors' replaced by those of another solution."""
-    return cast("Found", _put(first, rows, second, those))
+    return cast("PoseEstimates", _put(first, rows, second, those))
 
 
 def _put(first: Any, rows: IntArray, second: Any, those: IntArray) -> Any:

@@ -10,14 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.estimation.found import Found, are_doubted, joined
+from rfpose.multilat.estimation.found import PoseEstimates, are_doubted, joined
 from rfpose.multilat.ground import CalibrationSight, GroundSolution, Reflector, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import MirrorProblem, RigidPoses, solve_rigid
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.multilat.status import PoseStatus
 
-__all__ = ["Reflections", "solve_two_ray"]
+__all__ = ["ReflectionModel", "solve_two_ray"]
 
 IntArray = npt.NDArray[np.int64]
 _T = TypeVar("_T")
@@ -27,7 +27,7 @@ _START_SIGMA_M = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reflections:
+class ReflectionModel:
     """What reflects, and how it gets into ranges; see `rfpose.multilat.ground.solve_with_ground`.
 
     Attributes
@@ -50,7 +50,7 @@ class Reflections:
     free_space: bool
     propagation_speed_mps: float
 
-    def take(self, rows: IntArray) -> Reflections:
+    def take(self, rows: IntArray) -> ReflectionModel:
         """Select mirrors."""
         frame = self.calibration.frame
         if frame is None:
@@ -60,13 +60,13 @@ class Reflections:
 
 def solve_two_ray(
     problem: MirrorProblem,
-    reflections: Reflections,
+    reflections: ReflectionModel,
     alarms: Alarms | None,
     *,
     surveyed_enu_m: FloatArray,
     heliostat: IntArray,
     shared: Sequence[IntArray],
-) -> Found:
+) -> PoseEstimates:
     """Solve with planes that reflect, their coefficients shared.
 
     Parameters
@@ -99,7 +99,9 @@ def _better_start(problem: MirrorProblem, surveyed_enu_m: FloatArray) -> MirrorP
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
 
-def _two_ray_of(problem: MirrorProblem, reflections: Reflections, alarms: Alarms | None, heliostat: IntArray) -> Found:
+def _two_ray_of(
+    problem: MirrorProblem, reflections: ReflectionModel, alarms: Alarms | None, heliostat: IntArray
+) -> PoseEstimates:
     """Solve mirrors that share their coefficients; where a test finds something to leave out, once more without."""
     solution = _solve_ground(problem, reflections)
     better = _again(problem, reflections, solution, heliostat)
@@ -124,7 +126,7 @@ def _two_ray_of(problem: MirrorProblem, reflections: Reflections, alarms: Alarms
     sigma = np.zeros((n_plane, 2))
     estimated = [p for p, r in enumerate(reflections.reflectors) if r.estimated]
     sigma[estimated] = np.sqrt(np.diag(solution.coefficient_cov)).reshape(-1, 2)
-    return Found(
+    return PoseEstimates(
         poses=poses,
         status=status,
         fixed=solution.fixed,
@@ -141,7 +143,7 @@ def _two_ray_of(problem: MirrorProblem, reflections: Reflections, alarms: Alarms
 
 
 def _again(
-    problem: MirrorProblem, reflections: Reflections, solution: GroundSolution, heliostat: IntArray
+    problem: MirrorProblem, reflections: ReflectionModel, solution: GroundSolution, heliostat: IntArray
 ) -> MirrorProblem:
     """Return better poses to begin with for mirrors that ended in a false minimum, where any mirror did not.
 
@@ -169,7 +171,7 @@ def _again(
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=turned)
 
 
-def _solve_ground(problem: MirrorProblem, reflections: Reflections) -> GroundSolution:
+def _solve_ground(problem: MirrorProblem, reflections: ReflectionModel) -> GroundSolution:
     return solve_with_ground(
         problem,
         carrier_rf_hz=reflections.carrier_rf_hz,
@@ -181,7 +183,7 @@ def _solve_ground(problem: MirrorProblem, reflections: Reflections) -> GroundSol
     )
 
 
-def _in_order(parts: list[Found], order: IntArray, problem: MirrorProblem) -> Found:
+def _in_order(parts: list[PoseEstimates], order: IntArray, problem: MirrorProblem) -> PoseEstimates:
     """Put mirrors solved in parts back into their order."""
     if len(parts) == 1:
         return parts[0]
@@ -190,7 +192,7 @@ def _in_order(parts: list[Found], order: IntArray, problem: MirrorProblem) -> Fo
         return np.asarray(np.concatenate(arrays)[order])
 
     resolved = replace(problem, range_m=joined(*(p.problem.range_m for p in parts)))
-    return replace(_record_of(Found, parts, joined), problem=resolved)
+    return replace(_record_of(PoseEstimates, parts, joined), problem=resolved)
 
 
 def _record_of(kind: type[_T], records: list[_T], joined: Callable[..., npt.NDArray[Any]]) -> _T:

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.ground._problem import Problem, follow
-from rfpose.multilat.rigid.fits import Fits
+from rfpose.multilat.ground._problem import GroundProblem, follow
+from rfpose.multilat.rigid.fits import RigidFits
 from rfpose.multilat.status import has_start
 
 __all__ = ["MAX_CONDITION", "find", "information", "refine", "retry", "trusted"]
@@ -31,7 +31,7 @@ _FITS = 2.0
 """chi² over degrees of freedom of the middle mirror that leaves nothing to search for."""
 
 
-def find(problem: Problem, state: Fits, turn: FloatArray) -> FloatArray:
+def find(problem: GroundProblem, state: RigidFits, turn: FloatArray) -> FloatArray:
     """Coefficients to start from: the best of a grid, tried on mirrors spread over the field.
 
     Parameters
@@ -71,7 +71,7 @@ def find(problem: Problem, state: Fits, turn: FloatArray) -> FloatArray:
     return best
 
 
-def refine(problem: Problem, state: Fits, parameter: FloatArray) -> FloatArray:
+def refine(problem: GroundProblem, state: RigidFits, parameter: FloatArray) -> FloatArray:
     """Gauss-Newton on the coefficients from solved mirrors; ``state`` ends solved at what is returned."""
     if problem.n_parameter == 0:
         return parameter
@@ -103,7 +103,7 @@ def refine(problem: Problem, state: Fits, parameter: FloatArray) -> FloatArray:
     return parameter
 
 
-def retry(problem: Problem, start: Fits, state: Fits, parameter: FloatArray, turn: FloatArray) -> None:
+def retry(problem: GroundProblem, start: RigidFits, state: RigidFits, parameter: FloatArray, turn: FloatArray) -> None:
     """Solve mirrors that failed, or fit far worse than the rest, again from starts turned about."""
     ratio = state.chi2 / np.maximum(problem.dof, 1.0)
     usual = _usual(problem, state)
@@ -119,17 +119,17 @@ def retry(problem: Problem, start: Fits, state: Fits, parameter: FloatArray, tur
     state.put(rows[better], again.take(better))
 
 
-def trusted(problem: Problem, state: Fits) -> BoolArray:
+def trusted(problem: GroundProblem, state: RigidFits) -> BoolArray:
     """(mirror,) those that may speak about coefficients: solved, and not fitting far worse than the rest."""
     return np.asarray((state.status == 0) & (state.chi2 / np.maximum(problem.dof, 1.0) <= _usual(problem, state)))
 
 
-def information(state: Fits, good: BoolArray) -> FloatArray:
+def information(state: RigidFits, good: BoolArray) -> FloatArray:
     """Return what mirrors say about the coefficients together: the inverse of their covariance."""
     return np.asarray(state.schur[good].sum(axis=0))
 
 
-def _usual(problem: Problem, state: Fits) -> FloatArray:
+def _usual(problem: GroundProblem, state: RigidFits) -> FloatArray:
     """(mirror,) largest chi² over degrees of freedom that is not out of the ordinary."""
     dof = np.maximum(problem.dof, 1.0)
     solved = state.status == 0
@@ -137,13 +137,13 @@ def _usual(problem: Problem, state: Fits) -> FloatArray:
     return np.asarray(np.maximum(_FAR_WORSE * good, 1.0 + 6.0 * np.sqrt(2.0 / dof)))
 
 
-def _score(problem: Problem, start: Fits, parameter: FloatArray) -> float:
+def _score(problem: GroundProblem, start: RigidFits, parameter: FloatArray) -> float:
     trial = start.copy()
     problem.fit(trial, parameter, max_iteration=_MAX_ITERATION_TRIED)
     return _cost(problem, trial)
 
 
-def _cost(problem: Problem, state: Fits) -> float:
+def _cost(problem: GroundProblem, state: RigidFits) -> float:
     """How badly mirrors fit, none able to outweigh the rest."""
     with np.errstate(over="ignore"):
         return float(np.log1p(np.minimum(state.chi2, 1e12) / np.maximum(problem.dof, 1.0)).sum())

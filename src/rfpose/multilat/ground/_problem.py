@@ -9,16 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.multilat.equations import Mirrors
-from rfpose.multilat.reflection import Scene, direct_rays, shifts_at_points
-from rfpose.multilat.rigid.fits import FLOOR, Fits, Rule, begin, fit, predict
+from rfpose.multilat.equations import MirrorArrays
+from rfpose.multilat.reflection import SharedGeometry, direct_rays, shifts_at_points
+from rfpose.multilat.rigid.fits import FLOOR, FitRule, RigidFits, begin, fit, predict
 from rfpose.multilat.rigid.problem import MirrorProblem
 
-__all__ = ["CalibrationSight", "Problem", "build", "follow"]
+__all__ = ["CalibrationSight", "GroundProblem", "build", "follow"]
 
 IntArray = npt.NDArray[np.int64]
 
-_RULE = Rule(max_iteration=30, floor=FLOOR, longest_turn=0.2, settled=1e-4)
+_RULE = FitRule(max_iteration=30, floor=FLOOR, longest_turn=0.2, settled=1e-4)
 NO_TURN: FloatArray = np.zeros((1, 3))
 
 
@@ -58,7 +58,7 @@ class CalibrationSight:
         return cls(place_enu_m=as_float_array("calibration_enu_m", sight, ("calibration receiver", 3)))
 
 
-def follow(fits: Fits, step: FloatArray) -> None:
+def follow(fits: RigidFits, step: FloatArray) -> None:
     """Let poses and clocks follow a change of the coefficients, to first order."""
     from scipy.spatial.transform import Rotation
 
@@ -73,7 +73,7 @@ def follow(fits: Fits, step: FloatArray) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+class GroundProblem:
     """Measurements of mirrors, what is known of them, and the planes.
 
     Attributes
@@ -87,8 +87,8 @@ class Problem:
         Measurements and priors less a mirror's own unknowns.
     """
 
-    scene: Scene
-    mirrors: Mirrors
+    scene: SharedGeometry
+    mirrors: MirrorArrays
     calibration: CalibrationSight
     dof: FloatArray
 
@@ -114,7 +114,7 @@ class Problem:
         largest = np.where(self.scene.kind[self.scene.column >= 0] == 0, 0.95, 2.0)
         return np.asarray(parameter * np.repeat(np.minimum(1.0, largest / size), 2))
 
-    def take(self, rows: IntArray) -> Problem:
+    def take(self, rows: IntArray) -> GroundProblem:
         """Select mirrors."""
         mirrors = self.mirrors.take(rows)
         calibration = self.calibration
@@ -123,7 +123,7 @@ class Problem:
             calibration, mirrors = replace(calibration, frame=frame), mirrors._replace(frame=_rank(frame))
         return replace(self, mirrors=mirrors, calibration=calibration, dof=self.dof[rows])
 
-    def scene_at(self, parameter: FloatArray) -> Scene:
+    def scene_at(self, parameter: FloatArray) -> SharedGeometry:
         """Return the scene with estimated coefficients put in, and with what the calibration carries of them.
 
         Carriers have none of it: what is common to a mirror's receivers is unknown there anyway.
@@ -143,14 +143,14 @@ class Problem:
         common[:, :, tones] = self.calibration.change_m(np.delete(seen, (1, 2, 3), axis=3)[:, :, tones], self.frames)
         return scene._replace(common=common)
 
-    def begin(self, pivot: FloatArray, rot: FloatArray, status: IntArray) -> Fits:
+    def begin(self, pivot: FloatArray, rot: FloatArray, status: IntArray) -> RigidFits:
         """Return mirrors from which to begin, with the clocks that fit them best."""
         n_cov = 6 + self.mirrors.prior.clock[0].size
         return begin(self.mirrors, pivot, rot, status, n_cov=n_cov, n_parameter=self.n_parameter)
 
     def fit(
         self,
-        fits: Fits,
+        fits: RigidFits,
         parameter: FloatArray,
         *,
         turn: FloatArray = NO_TURN,
@@ -161,11 +161,11 @@ class Problem:
         rule = _RULE._replace(max_iteration=max_iteration)
         fit(self.scene_at(parameter), self.mirrors, rule, fits, turn=turn, enough=enough)
 
-    def predict(self, fits: Fits, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def predict(self, fits: RigidFits, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
         return predict(self.scene_at(parameter), self.mirrors, fits)
 
-    def direct(self) -> Problem:
+    def direct(self) -> GroundProblem:
         """Leave all reflections out."""
         return replace(
             self,
@@ -175,13 +175,15 @@ class Problem:
         )
 
 
-def build(scene: Scene, mirrors: MirrorProblem, *, calibration: CalibrationSight | npt.ArrayLike | None) -> Problem:
+def build(
+    scene: SharedGeometry, mirrors: MirrorProblem, *, calibration: CalibrationSight | npt.ArrayLike | None
+) -> GroundProblem:
     """Lay out mirrors with their integers resolved."""
     calibration = CalibrationSight.checked(calibration)
     arrays = mirrors.equations
     if calibration.frame is not None:
         arrays = arrays._replace(frame=_rank(calibration.frame))
-    return Problem(scene=scene, mirrors=arrays, calibration=calibration, dof=mirrors.dof)
+    return GroundProblem(scene=scene, mirrors=arrays, calibration=calibration, dof=mirrors.dof)
 
 
 def _rank(frame: IntArray) -> IntArray:

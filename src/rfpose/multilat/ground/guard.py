@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.ground._problem import Problem
+from rfpose.multilat.ground._problem import GroundProblem
 from rfpose.multilat.ground.solve import GroundSolution, turns
 from rfpose.multilat.integrity.guard import Alarms, Guard, GuardedPoses, TransmitterStatus
 from rfpose.multilat.integrity.hypotheses import Verdict
-from rfpose.multilat.rigid.fits import Fits
+from rfpose.multilat.rigid.fits import RigidFits
 from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.multilat.status import PoseStatus, has_start
 
@@ -60,9 +60,9 @@ class _Guard(Guard):
         # the covariance of the solution counts the coefficients, that of the state does not
         self.extra_cov = solution.full_cov - solution.state.cov
         self.tested: IntArray = np.zeros(0, np.int64)
-        self.tried: list[tuple[Fits, IntArray]] = []
+        self.tried: list[tuple[RigidFits, IntArray]] = []
 
-    def _without(self, rows: IntArray, h: int) -> tuple[Problem, IntArray]:
+    def _without(self, rows: IntArray, h: int) -> tuple[GroundProblem, IntArray]:
         """Problem of some mirrors without a transmitter or the pivot; how many degrees of freedom that frees."""
         weight, dropped = self.without(rows, h)
         problem = self.solution.problem.take(rows)
@@ -107,7 +107,7 @@ class _Guard(Guard):
             link=link, link_dof=link.astype(np.int64),
         )  # fmt: skip
 
-    def _retry(self, problem: Problem, state: Fits, rows: IntArray) -> None:
+    def _retry(self, problem: GroundProblem, state: RigidFits, rows: IntArray) -> None:
         dof = np.maximum(self.poses["dof"][rows], 1.0)
         ruined = np.flatnonzero(
             ~has_start(state.status) | (state.chi2 > 30.0 * dof) & (self.state.chi2[rows] > 30.0 * dof)
@@ -130,7 +130,7 @@ class _Guard(Guard):
             self._leave_out(self.tested[at], int(h), fits.take(np.flatnonzero(at)), count[at])
         return np.asarray(rows[helps])
 
-    def _leave_out(self, rows: IntArray, h: int, fits: Fits, count: IntArray) -> None:
+    def _leave_out(self, rows: IntArray, h: int, fits: RigidFits, count: IntArray) -> None:
         """Accept poses without one transmitter or the pivot."""
         who = np.full(len(rows), h)
         noisy = self.noisy(rows, who) if h < self.n_transmitter else None
@@ -151,7 +151,7 @@ class _Guard(Guard):
         self.mark(rows)
 
 
-def _tilt_covariance(fits: Fits) -> FloatArray:
+def _tilt_covariance(fits: RigidFits) -> FloatArray:
     """Covariance of the rotation about the mirror's own x and y axes (mirror, 2, 2)."""
     axes = fits.rot[:, :, :2]
     return np.asarray(np.einsum("mac,mab,mbd->mcd", axes, fits.cov[:, 3:6, 3:6], axes))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.multilat.reflection import Scene, shifts_at_points
+from rfpose.multilat.reflection import SharedGeometry, shifts_at_points
 
 __all__ = ["LEVEL_GROUND", "Reflector", "Surface", "build_scene", "fresnel_coefficient", "heights_m", "range_shift_m"]
 
@@ -192,7 +192,7 @@ def build_scene(
     tone_hz: FloatArray,
     free_space: bool,
     propagation_speed_mps: float,
-) -> Scene:
+) -> SharedGeometry:
     """Arrays for the kernels; arguments as in `range_shift_m`. Coefficients to be estimated start at zero.
 
     Raises
@@ -222,7 +222,7 @@ def build_scene(
             free += 2
         else:
             coefficient[p] = 1.0 if reflector.coefficient is None else reflector.coefficient
-    return Scene(
+    return SharedGeometry(
         transmitter=np.array(transmitter),
         image=image,
         normal=np.array([geometry.unit(r.normal_enu) for r in reflectors]).reshape(-1, 3),

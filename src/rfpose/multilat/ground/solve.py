@@ -17,7 +17,7 @@ from rfpose.checks import FloatArray, as_float_array, as_positive
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._coefficients import MAX_CONDITION
-from rfpose.multilat.ground._problem import NO_TURN, CalibrationSight, Problem, build
+from rfpose.multilat.ground._problem import NO_TURN, CalibrationSight, GroundProblem, build
 from rfpose.multilat.ground.integers import resolve
 from rfpose.multilat.ground.model import (
     LEVEL_GROUND,
@@ -27,7 +27,7 @@ from rfpose.multilat.ground.model import (
     build_scene,
     heights_m,
 )
-from rfpose.multilat.rigid.fits import Fits
+from rfpose.multilat.rigid.fits import RigidFits
 from rfpose.multilat.rigid.pose import RigidPoses
 from rfpose.multilat.rigid.problem import MirrorProblem, Observation
 from rfpose.multilat.status import PoseStatus, has_start
@@ -83,8 +83,8 @@ class GroundSolution:
     probability_direct: FloatArray
     probability: FloatArray
     status: IntArray
-    problem: Problem
-    state: Fits
+    problem: GroundProblem
+    state: RigidFits
     parameter: FloatArray
 
 
@@ -148,7 +148,7 @@ def solve_with_ground(
         propagation_speed_mps=speed,
     )
 
-    def lay_out(ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> Problem:
+    def lay_out(ranges: list[FloatArray], pivot: FloatArray, rot: FloatArray) -> GroundProblem:
         count = len(ranges)
         used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :, :count].copy())
         begun = replace(
@@ -225,7 +225,7 @@ def turns() -> FloatArray:
     return np.concatenate([NO_TURN, _TURN_RAD * cube[inside][np.argsort(length[inside])]])
 
 
-def _direct_probability(problem: Problem, start: Fits) -> FloatArray:
+def _direct_probability(problem: GroundProblem, start: RigidFits) -> FloatArray:
     """(mirror,) probability of the residuals with the direct ray alone."""
     direct = problem.direct()
     state = direct.begin(start.pivot, start.rot, start.status)
@@ -240,7 +240,7 @@ def _probability(chi2: FloatArray, dof: FloatArray, solved: BoolArray) -> FloatA
     return np.asarray(np.where(known, chdtrc(np.maximum(dof, 1e-9), np.where(known, chi2, 0.0)), np.nan))
 
 
-def _coefficient_cov(problem: Problem, state: Fits) -> FloatArray:
+def _coefficient_cov(problem: GroundProblem, state: RigidFits) -> FloatArray:
     """Covariance of the coefficients; NaN where the mirrors do not determine them."""
     information = _coefficients.information(state, _coefficients.trusted(problem, state))
     if information.size and not (np.any(information) and np.linalg.cond(information) < MAX_CONDITION):
@@ -248,7 +248,7 @@ def _coefficient_cov(problem: Problem, state: Fits) -> FloatArray:
     return np.asarray(np.linalg.inv(information))
 
 
-def joint_covariance(state: Fits, coefficient_cov: FloatArray) -> FloatArray:
+def joint_covariance(state: RigidFits, coefficient_cov: FloatArray) -> FloatArray:
     """(mirror, unknown + parameter, unknown + parameter) of pose, clocks and coefficients."""
     n_mirror, n_own, n_parameter = state.follow.shape
     follow = state.follow
@@ -261,8 +261,8 @@ def joint_covariance(state: Fits, coefficient_cov: FloatArray) -> FloatArray:
 
 
 def _solution(
-    problem: Problem,
-    state: Fits,
+    problem: GroundProblem,
+    state: RigidFits,
     parameter: FloatArray,
     places: FloatArray,
     reflectors: Sequence[Reflector],

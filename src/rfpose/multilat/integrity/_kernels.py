@@ -20,7 +20,7 @@ from rfpose.multilat.reflection._kernels import work_for
 from rfpose.multilat.rigid._kernels import predict
 
 
-class Solved(NamedTuple):
+class SolvedMirrors(NamedTuple):
     """What the data alone say of each mirror's unknowns at its pose, and the covariance with all that is known."""
 
     ok: Any
@@ -29,7 +29,7 @@ class Solved(NamedTuple):
     cov: Any
 
 
-class Tests(NamedTuple):
+class HypothesisTests(NamedTuple):
     """Statistics of hypotheses; as in `rfpose.multilat.integrity.hypotheses.Verdict`."""
 
     stat: Any

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.equations import Mirrors
+from rfpose.multilat.equations import MirrorArrays
 from rfpose.multilat.integrity.hypotheses import (
     Verdict,
     largest_eigenvalue,
@@ -195,7 +195,7 @@ class Guard(ABC):
         How many single tests share the false alarms.
     """
 
-    def __init__(self, poses: RigidPoses, mirrors: Mirrors, alarms: Alarms, n_test: int) -> None:
+    def __init__(self, poses: RigidPoses, mirrors: MirrorArrays, alarms: Alarms, n_test: int) -> None:
         n_mirror, _, _, self.n_transmitter = mirrors.z.shape
         self.mirrors = mirrors
         self.poses: dict[str, npt.NDArray[Any]] = {f.name: np.array(getattr(poses, f.name)) for f in fields(poses)}

@@ -85,13 +85,13 @@ def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
     mirrors = problem.weighed(_TIE_FLOOR)
     n_mirror, n_group, n_receiver, n_transmitter = mirrors.z.shape
     n_hypothesis, n = n_transmitter + len(PRIORS), 6 + problem.n_class * n_receiver
-    solved = _kernels.Solved(
+    solved = _kernels.SolvedMirrors(
         ok=np.zeros(n_mirror, np.bool_),
         data_info=np.zeros((n_mirror, n, n)),
         data_gradient=np.zeros((n_mirror, n)),
         cov=np.zeros((n_mirror, n, n)),
     )
-    tests = _kernels.Tests(
+    tests = _kernels.HypothesisTests(
         stat=np.zeros((n_mirror, n_hypothesis)),
         dof=np.zeros((n_mirror, n_hypothesis), np.int64),
         hidden=np.zeros((n_mirror, n_hypothesis), np.bool_),
@@ -138,8 +138,8 @@ def _prior_faults(problem: MirrorProblem, rot: FloatArray) -> list[FloatArray]:
 
 
 def _free_prior(
-    solved: _kernels.Solved,
-    tests: _kernels.Tests,
+    solved: _kernels.SolvedMirrors,
+    tests: _kernels.HypothesisTests,
     rows: IntArray,
     h: int,
     axes: FloatArray,

@@ -25,7 +25,7 @@ Complex128 = npt.NDArray[np.complex128]
 Int64 = npt.NDArray[np.int64]
 
 
-class Scene(NamedTuple):
+class SharedGeometry(NamedTuple):
     """What all mirrors have in common.
 
     ``image`` (plane, transmitter, 3) and ``normal`` (plane, 3); ``tone_k`` (group,) is zero for the carrier;
@@ -47,7 +47,7 @@ class Scene(NamedTuple):
     common: Float64
 
 
-class Work(NamedTuple):
+class ShiftRoom(NamedTuple):
     """Room for `shift_at`."""
 
     strength: Complex128
@@ -61,7 +61,7 @@ class Work(NamedTuple):
 
 @kernel
 def work_for(n_plane):
-    return Work(
+    return ShiftRoom(
         np.empty(n_plane, np.complex128),
         np.empty((n_plane, 3), np.complex128),
         np.empty(n_plane),

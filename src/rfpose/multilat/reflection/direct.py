@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.reflection._kernels import Scene
+from rfpose.multilat.reflection._kernels import SharedGeometry
 
 __all__ = ["direct_rays"]
 
 
-def direct_rays(transmitter_enu_m: FloatArray, n_group: int) -> Scene:
+def direct_rays(transmitter_enu_m: FloatArray, n_group: int) -> SharedGeometry:
     """Return the direct ray alone, of transmitters (transmitter, xyz) [m]."""
     n_transmitter = len(transmitter_enu_m)
-    return Scene(
+    return SharedGeometry(
         transmitter=np.array(transmitter_enu_m),
         image=np.zeros((0, n_transmitter, 3)),
         normal=np.zeros((0, 3)),

@@ -2,10 +2,10 @@
 
 from rfpose.multilat.rigid.places import ReceiverPlaces, places_bound, refine_places
 from rfpose.multilat.rigid.pose import RigidPoses, full_covariance, rigid_bound, solve_rigid, tilt_sigma_rad
-from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid.problem import MirrorKnowledge, MirrorProblem, Observation
 
 __all__ = [
-    "Knowledge",
+    "MirrorKnowledge",
     "MirrorProblem",
     "Observation",
     "ReceiverPlaces",

@@ -29,7 +29,7 @@ from rfpose.multilat.status import PoseStatus
 SOLVED, OPEN, STUCK = int(PoseStatus.OK), int(PoseStatus.UNDETERMINED), int(PoseStatus.NOT_CONVERGED)
 
 
-class Rule(NamedTuple):
+class FitRule(NamedTuple):
     """When a fit ends: steps, smallest pivot that counts as observed, longest turn of a step [rad], what is no step."""
 
     max_iteration: int
@@ -38,7 +38,7 @@ class Rule(NamedTuple):
     settled: float
 
 
-class Fits(NamedTuple):
+class RigidFits(NamedTuple):
     """Where each mirror stands, changed in place by fits; mirror is the first axis.
 
     ``cov`` of the first unknowns (pose, then clocks) is at given coefficients; ``follow`` (mirror, unknown, parameter)
@@ -56,15 +56,15 @@ class Fits(NamedTuple):
     n_iteration: Int64
     status: Int64
 
-    def take(self, rows: Int64) -> Fits:
+    def take(self, rows: Int64) -> RigidFits:
         """Copy some mirrors."""
-        return Fits(**{name: array[rows] for name, array in self._asdict().items()})
+        return RigidFits(**{name: array[rows] for name, array in self._asdict().items()})
 
-    def copy(self) -> Fits:
+    def copy(self) -> RigidFits:
         """Copy all."""
-        return Fits(**{name: array.copy() for name, array in self._asdict().items()})
+        return RigidFits(**{name: array.copy() for name, array in self._asdict().items()})
 
-    def put(self, rows: Int64, other: Fits) -> None:
+    def put(self, rows: Int64, other: RigidFits) -> None:
         """Write mirrors back."""
         for array, new in zip(self, other, strict=True):
             array[rows] = new

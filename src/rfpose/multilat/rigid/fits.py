@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.equations import Mirrors
-from rfpose.multilat.reflection import Scene
+from rfpose.multilat.equations import MirrorArrays
+from rfpose.multilat.reflection import SharedGeometry
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid._kernels import Fits, Rule
+from rfpose.multilat.rigid._kernels import FitRule, RigidFits
 
-__all__ = ["FLOOR", "NO_TURN", "Fits", "Rule", "begin", "fit", "predict"]
+__all__ = ["FLOOR", "NO_TURN", "FitRule", "RigidFits", "begin", "fit", "predict"]
 
 FLOOR = 1e-13
 """Smallest share of an unknown's information that the other unknowns may leave before it counts as unobserved."""
@@ -20,18 +20,18 @@ NO_TURN: FloatArray = np.zeros((0, 3))
 
 
 def begin(
-    mirrors: Mirrors,
+    mirrors: MirrorArrays,
     pivot: FloatArray,
     rot: FloatArray,
     status: npt.NDArray[np.int64],
     *,
     n_cov: int,
     n_parameter: int = 0,
-) -> Fits:
+) -> RigidFits:
     """Nothing solved yet; covariances are kept of the first ``n_cov`` unknowns."""
     clock = mirrors.prior.clock
     n_mirror, n_class, n_receiver = clock.shape
-    return Fits(
+    return RigidFits(
         pivot=pivot.copy(),
         rot=rot.copy(),
         clock=clock.copy(),
@@ -46,10 +46,10 @@ def begin(
 
 
 def fit(
-    scene: Scene,
-    mirrors: Mirrors,
-    rule: Rule,
-    fits: Fits,
+    scene: SharedGeometry,
+    mirrors: MirrorArrays,
+    rule: FitRule,
+    fits: RigidFits,
     *,
     turn: FloatArray = NO_TURN,
     enough: FloatArray | float = np.inf,
@@ -63,7 +63,7 @@ def fit(
     _kernels.fit_many(n_mirror, scene, mirrors, rule, turn, enough, fits)
 
 
-def predict(scene: Scene, mirrors: Mirrors, fits: Fits) -> tuple[FloatArray, FloatArray]:
+def predict(scene: SharedGeometry, mirrors: MirrorArrays, fits: RigidFits) -> tuple[FloatArray, FloatArray]:
     """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
     n_group = mirrors.z.shape[1] if len(scene.image) else 1
     predicted = np.empty((len(mirrors.z), n_group, *mirrors.z.shape[2:]))

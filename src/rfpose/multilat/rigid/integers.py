@@ -21,7 +21,7 @@ from rfpose.multilat.rigid.problem import MirrorProblem
 from rfpose.multilat.rigid.search import (
     DELAY_REACH_M,
     Candidates,
-    Prediction,
+    PredictedRanges,
     can_search,
     predict,
     search_integers,
@@ -240,7 +240,7 @@ class _Ladder:
         self.method[which, k] = IntegerMethod.ROUNDED
         self.resolved[k][which] = ranges[which]
 
-    def _search(self, k: int, mirrors: IntArray, poses: RigidPoses, prediction: Prediction) -> None:
+    def _search(self, k: int, mirrors: IntArray, poses: RigidPoses, prediction: PredictedRanges) -> None:
         """Resolve by least squares what could not be rounded."""
         for part in np.array_split(mirrors, -(-len(mirrors) // _SEARCH_ROWS)):
             found = search_integers(self.problem.take(part), k, prediction.take(part))
@@ -312,7 +312,7 @@ def _is_unlikely(poses: RigidPoses) -> BoolArray:
     return np.asarray(rare | (poses.status == PoseStatus.NOT_CONVERGED))
 
 
-def _round(problem: MirrorProblem, k: int, prediction: Prediction) -> tuple[FloatArray, FloatArray]:
+def _round(problem: MirrorProblem, k: int, prediction: PredictedRanges) -> tuple[FloatArray, FloatArray]:
     """Round the integers of wavelength k; return resolved ranges and the risk that any is wrong (mirror,)."""
     from scipy.special import erfc
 

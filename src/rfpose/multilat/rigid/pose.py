@@ -15,13 +15,13 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.reflection import direct_rays
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.fits import FLOOR, Rule, begin, fit
+from rfpose.multilat.rigid.fits import FLOOR, FitRule, begin, fit
 from rfpose.multilat.rigid.problem import MirrorProblem
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["RigidPoses", "full_covariance", "rigid_bound", "solve_rigid", "tilt_sigma_rad"]
 
-_RULE = Rule(max_iteration=40, floor=FLOOR, longest_turn=0.5, settled=1e-6)  # a thousandth of a sigma
+_RULE = FitRule(max_iteration=40, floor=FLOOR, longest_turn=0.5, settled=1e-6)  # a thousandth of a sigma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,11 +12,11 @@ import numpy.typing as npt
 from rfpose import geometry
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import GeometryError, InvalidInputError
-from rfpose.multilat.equations import Mirrors, Prior
+from rfpose.multilat.equations import MirrorArrays, MirrorPrior
 from rfpose.multilat.reflection import direct_rays
 from rfpose.multilat.rigid import _kernels
 
-__all__ = ["PRIORS", "Knowledge", "MirrorProblem", "Observation"]
+__all__ = ["PRIORS", "MirrorKnowledge", "MirrorProblem", "Observation"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -29,7 +29,7 @@ STIFFEST_TIE = 1e-8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Knowledge:
+class MirrorKnowledge:
     """What is known about mirrors besides the phases.
 
     Attributes
@@ -58,7 +58,7 @@ class Knowledge:
         """Whether pivots are surveyed."""
         return self.pivot_enu_m is not None and bool(np.isfinite(self.pivot_sigma_m))
 
-    def take(self, rows: IntArray) -> Knowledge:
+    def take(self, rows: IntArray) -> MirrorKnowledge:
         """Select mirrors."""
         return self if self.pivot_enu_m is None else replace(self, pivot_enu_m=self.pivot_enu_m[rows])
 
@@ -130,7 +130,7 @@ class MirrorProblem:
     clock_class: IntArray
     start_pivot_enu_m: FloatArray
     start_rot_enu_from_mirror: FloatArray
-    knowledge: Knowledge
+    knowledge: MirrorKnowledge
     wavelength_m: FloatArray
     is_carrier: BoolArray
     dropped: BoolArray
@@ -147,7 +147,7 @@ class MirrorProblem:
         clock_class: npt.ArrayLike,
         start_pivot_enu_m: npt.ArrayLike,
         start_rot_enu_from_mirror: npt.ArrayLike,
-        knowledge: Knowledge | None = None,
+        knowledge: MirrorKnowledge | None = None,
     ) -> MirrorProblem:
         """Return mirrors whose whole wavelengths are resolved; arrays as the attributes, broadcast.
 
@@ -168,7 +168,7 @@ class MirrorProblem:
         sigma = np.broadcast_to(np.asarray(sigma_m, np.float64), z.shape)
         if np.any(sigma <= 0.0):
             raise InvalidInputError("`sigma_m` must be greater than zero")
-        known = knowledge or Knowledge()
+        known = knowledge or MirrorKnowledge()
         if known.pivot_enu_m is not None:
             known = replace(known, pivot_enu_m=_spread(known.pivot_enu_m, (n_mirror, 3)))
         return cls(
@@ -195,7 +195,7 @@ class MirrorProblem:
         *,
         start_pivot_enu_m: npt.ArrayLike,
         start_rot_enu_from_mirror: npt.ArrayLike,
-        knowledge: Knowledge | None = None,
+        knowledge: MirrorKnowledge | None = None,
     ) -> MirrorProblem:
         """Return mirrors whose finer wavelengths are to be resolved: tones, coarsest first, then the carrier.
 
@@ -242,7 +242,7 @@ class MirrorProblem:
         sigma_m: npt.ArrayLike,
         transmitter_sigma_m: npt.ArrayLike,
         clock_class: npt.ArrayLike,
-        knowledge: Knowledge | None = None,
+        knowledge: MirrorKnowledge | None = None,
     ) -> MirrorProblem:
         """Return mirrors in known poses, of which nothing is measured yet: for bounds. Arrays as in `of`."""
         sigma = as_float_array("sigma_m", sigma_m, ("mirror", "group", "receiver", "transmitter"), finite=False)
@@ -332,7 +332,7 @@ class MirrorProblem:
         return np.asarray(given & ~self.dropped)
 
     @cached_property
-    def equations(self) -> Mirrors:
+    def equations(self) -> MirrorArrays:
         """What the solvers' equations weigh; clocks begin, and stay if nothing moves them, where they fit best."""
         mirrors = self.weighed()
         scene = direct_rays(self.transmitter_enu_m, self.range_m.shape[1])
@@ -342,7 +342,7 @@ class MirrorProblem:
         )  # fmt: skip
         return mirrors
 
-    def weighed(self, stiffest_tie: float = STIFFEST_TIE) -> Mirrors:
+    def weighed(self, stiffest_tie: float = STIFFEST_TIE) -> MirrorArrays:
         """`equations` about clocks of zero, where a shared clock is no stiffer than told (see `STIFFEST_TIE`)."""
         known, has, n_mirror = self.knowledge, self.has_prior, len(self.range_m)
         sigma, common = self.sigma_m, self.transmitter_sigma_m
@@ -351,13 +351,13 @@ class MirrorProblem:
         with np.errstate(divide="ignore"):
             bias_info = np.array(np.where(np.isnan(common), 0.0, 1.0 / common**2))
         own, tie = self._clock_ties(weight, bias_info, stiffest_tie)
-        return Mirrors(
+        return MirrorArrays(
             receiver_mirror=np.ascontiguousarray(self.receiver_mirror_m),
             z=np.nan_to_num(self.range_m),
             weight=weight,
             bias_info=bias_info,
             clock_class=self.clock_class,
-            prior=Prior(
+            prior=MirrorPrior(
                 pivot=np.zeros((n_mirror, 3)) if known.pivot_enu_m is None else np.array(known.pivot_enu_m),
                 pivot_info=has[:, 0, None, None] * (np.eye(3) / known.pivot_sigma_m**2),
                 roll_info=np.where(has[:, 1], known.roll_sigma_rad**-2, 0.0),

@@ -16,9 +16,9 @@ from rfpose.checks import FloatArray
 from rfpose.multilat.ambiguity import integer_least_squares
 from rfpose.multilat.rigid import _kernels
 from rfpose.multilat.rigid.pose import RigidPoses
-from rfpose.multilat.rigid.problem import Knowledge, MirrorProblem
+from rfpose.multilat.rigid.problem import MirrorKnowledge, MirrorProblem
 
-__all__ = ["Candidates", "Prediction", "can_search", "predict", "search_integers"]
+__all__ = ["Candidates", "PredictedRanges", "can_search", "predict", "search_integers"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ N_CANDIDATE = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Prediction:
+class PredictedRanges:
     """What a pose says of ranges.
 
     Attributes
@@ -54,9 +54,9 @@ class Prediction:
     cov: FloatArray
     bend_m: FloatArray
 
-    def take(self, rows: IntArray) -> Prediction:
+    def take(self, rows: IntArray) -> PredictedRanges:
         """Select mirrors."""
-        return Prediction(**{f.name: getattr(self, f.name)[rows] for f in fields(Prediction)})
+        return PredictedRanges(**{f.name: getattr(self, f.name)[rows] for f in fields(PredictedRanges)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ class Candidates:
     adop_cycles: FloatArray
 
 
-def predict(problem: MirrorProblem, poses: RigidPoses) -> Prediction:
+def predict(problem: MirrorProblem, poses: RigidPoses) -> PredictedRanges:
     """Return distances at the given poses, with their derivative."""
     arm = np.einsum("mab,mrb->mra", poses.rot_enu_from_mirror, problem.receiver_mirror_m)
     to_receiver = (poses.pivot_enu_m[:, None] + arm)[:, :, None] - problem.transmitter_enu_m
@@ -96,7 +96,7 @@ def predict(problem: MirrorProblem, poses: RigidPoses) -> Prediction:
     # more than twice its length
     turn2 = np.minimum(np.trace(poses.cov[:, 3:, 3:], axis1=1, axis2=2), 2.0)
     bend = np.linalg.norm(arm, axis=-1) * turn2[:, None]
-    return Prediction(
+    return PredictedRanges(
         distance_m=distance,
         slope=np.concatenate([direction, np.cross(arm[:, :, None], direction)], axis=-1),
         cov=poses.cov,
@@ -110,7 +110,7 @@ def can_search(problem: MirrorProblem, k: int) -> bool:
     return not calibrated or bool(np.ptp(problem.wavelength_m[k]) == 0.0)
 
 
-def search_integers(problem: MirrorProblem, k: int, prediction: Prediction) -> Candidates:
+def search_integers(problem: MirrorProblem, k: int, prediction: PredictedRanges) -> Candidates:
     """Find the likeliest integers of wavelength k for every mirror, of whose poses so far ``prediction`` is."""
     range_m, sigma_m, wavelength_m = problem.range_m[:, k], problem.sigma_m[:, k], problem.wavelength_m[k]
     transmitter_sigma_m = problem.transmitter_sigma_m[:, k]
@@ -175,7 +175,7 @@ def search_integers(problem: MirrorProblem, k: int, prediction: Prediction) -> C
 
 
 def _references(
-    seen: BoolArray, calibrated: bool, wavelength_m: FloatArray, known: Knowledge
+    seen: BoolArray, calibrated: bool, wavelength_m: FloatArray, known: MirrorKnowledge
 ) -> tuple[IntArray, IntArray, float]:
     """Choose what comes off each range; return it and the clock variance that remains [m²].
 

@@ -12,12 +12,12 @@ from rfpose.multilat.site.fit import (
     fit_site,
     spread_starts,
 )
-from rfpose.multilat.site.forecast import Disturbance, ForeseenMirrors, forecast_site
+from rfpose.multilat.site.forecast import ForeseenMirrors, WorldErrors, forecast_site
 from rfpose.multilat.site.survey import (
     CASES,
-    Constants,
     ReferencePoses,
     Survey,
+    SurveyConstants,
     SurveyPrior,
     lever_to_turn,
     survey_site,
@@ -26,8 +26,6 @@ from rfpose.multilat.site.survey import (
 __all__ = [
     "CASES",
     "Common",
-    "Constants",
-    "Disturbance",
     "FieldAt",
     "ForeseenMirrors",
     "PostureCorrelation",
@@ -37,8 +35,10 @@ __all__ = [
     "SitePoses",
     "SiteSettings",
     "Survey",
+    "SurveyConstants",
     "SurveyPrior",
     "Voltages",
+    "WorldErrors",
     "fit_site",
     "forecast_site",
     "found_correlation",

@@ -20,7 +20,7 @@ _FREE = 1e-3
 """Information on what nothing is known of, so that equations stay regular: 30 m, 30 rad."""
 
 
-class Seen(NamedTuple):
+class SiteArrays(NamedTuple):
     """`SiteObservations`, the strength of each transmitter's direct field (mirror, transmitter), and its crowd.
 
     The crowd (transmitter,) is how many carriers of one antenna hear the same of what nothing foresees.
@@ -33,7 +33,7 @@ class Seen(NamedTuple):
     crowd: Any
 
 
-class Heard(NamedTuple):
+class VoltageArrays(NamedTuple):
     """`Voltages`, ray by ray; ``order`` puts rays of one mirror and ``group`` (factor error) beside each other."""
 
     first: Any
@@ -54,7 +54,7 @@ class Heard(NamedTuple):
     reference_rot: Any
 
 
-class Prior(NamedTuple):
+class SitePrior(NamedTuple):
     """`SiteKnowledge` as information (1/σ²)."""
 
     pivot: Any
@@ -65,7 +65,7 @@ class Prior(NamedTuple):
     clock_info: float
 
 
-class Law(NamedTuple):
+class StrayLaw(NamedTuple):
     """How what nothing foresees is distributed, and when a fit ends."""
 
     floor: float
@@ -74,7 +74,7 @@ class Law(NamedTuple):
     max_steps: int
 
 
-class Ended(NamedTuple):
+class SiteFits(NamedTuple):
     """What a fit gives, mirror by mirror; ``pivot`` and ``rot`` hold where it begins.
 
     ``factor`` (mirror, kind, 2) and ``soil`` (mirror, 2, 2): what measurements say of factor errors; of no rows where

@@ -326,9 +326,9 @@ def fit_site(
         Arrays that do not fit each other.
     """
     chosen = settings or SiteSettings()
-    fit = Fit(observations, knowledge, chosen)
+    fit = SiteFit(observations, knowledge, chosen)
     known, everyone, some = known_mirrors(knowledge)
-    common, state, before = given_common(chosen), State.begin(knowledge), 0j
+    common, state, before = given_common(chosen), FitState.begin(knowledge), 0j
     # poses first: what all have in common cannot be told from mirrors that are whole wavelengths off
     state = _of_all_rolls(fit, field_at, _of_all_starts(fit, field_at, state, some, common), some, common)
     for k in range(chosen.rounds + _MORE_ROUNDS):
@@ -348,7 +348,7 @@ def fit_site(
 
 def heard_by(
     voltages: Voltages, shape: tuple[int, ...], mast: IntArray | None, settings: SiteSettings, common: Common
-) -> _kernels.Heard:
+) -> _kernels.VoltageArrays:
     """Return voltages of (mirror, receiver, transmitter) as the kernels take them."""
     return _Prepared.of(voltages, shape, mast).heard(settings, common)
 
@@ -374,7 +374,7 @@ def known_mirrors(knowledge: SiteKnowledge) -> tuple[BoolArray, IntArray, IntArr
     return known, everyone, everyone[spread[: len(everyone)]]
 
 
-def field_of(field_at: FieldAt, state: State, rows: IntArray, common: Common) -> Voltages:
+def field_of(field_at: FieldAt, state: FitState, rows: IntArray, common: Common) -> Voltages:
     """Return what some mirrors would receive where they are found to be."""
     rot = np.full(state.rot.shape, np.nan)
     rot[rows] = state.rot[rows]
@@ -407,7 +407,7 @@ def spread_starts(posture_sigma_rad: float, lever_m: float, wavelength_m: float)
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class FitState:
     """Where the fit of each mirror stands; arrays as the kernel gives them, pose covariance in turn, then pivot."""
 
     pivot: FloatArray
@@ -424,7 +424,7 @@ class State:
     ambiguous: BoolArray
 
     @classmethod
-    def begin(cls, known: SiteKnowledge) -> State:
+    def begin(cls, known: SiteKnowledge) -> FitState:
         """Return mirrors as commanded, of which nothing is found yet."""
         n, n_rx = known.receiver_mirror_m.shape[:2]
         link = (n, n_rx, known.unit_field.shape[1])
@@ -435,11 +435,11 @@ class State:
             dof=row.copy(), cost=row.copy(), steps=np.full(n, -1, np.int64), ambiguous=np.zeros(n, np.bool_),
         )  # fmt: skip
 
-    def copy(self) -> State:
+    def copy(self) -> FitState:
         """Return one that may be written into."""
-        return State(*(getattr(self, name).copy() for name in State.__dataclass_fields__))
+        return FitState(*(getattr(self, name).copy() for name in FitState.__dataclass_fields__))
 
-    def with_poses_of(self, other: State, rows: BoolArray) -> State:
+    def with_poses_of(self, other: FitState, rows: BoolArray) -> FitState:
         """Return this with some mirrors where the other has them."""
         out = self.copy()
         out.pivot[rows], out.rot[rows] = other.pivot[rows], other.rot[rows]
@@ -447,14 +447,14 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class FactorShares:
     """What measurements say of factor errors: (mirror, kind, 2) squares and shares told; (mirror, 2, 2) of the soil."""
 
     factor: FloatArray
     soil: FloatArray
 
     @classmethod
-    def of(cls, n: int) -> Told:
+    def of(cls, n: int) -> FactorShares:
         return cls(np.full((n, len(RayKind), 2), np.nan), np.full((n, 2, 2), np.nan))
 
 
@@ -474,7 +474,7 @@ def _alike(one: Common, other: Common) -> bool:
     return bool(max(change, abs(np.log(one.floor / other.floor))) < _LEARN_SETTLED)
 
 
-class Fit:
+class SiteFit:
     """The kernel with everything that does not change from call to call."""
 
     def __init__(
@@ -493,7 +493,7 @@ class Fit:
         self.seen, self.known, self.settings = observations, knowledge, settings
         self._max_steps = max_steps
         self._own_scale = 0.0 if np.isinf(settings.own_scale) else settings.own_scale
-        self._links = _kernels.Seen(
+        self._links = _kernels.SiteArrays(
             np.ascontiguousarray(observations.carrier, np.complex128),
             np.ascontiguousarray(observations.sigma, np.float64),
             np.ascontiguousarray(observations.wavenumber_radpm, np.float64),
@@ -505,7 +505,7 @@ class Fit:
                 float(np.float64(sigma) ** -2.0)
                 for sigma in (knowledge.pivot_sigma_m, knowledge.roll_sigma_rad, knowledge.clock_sigma_m)
             )
-        self._prior = _kernels.Prior(
+        self._prior = _kernels.SitePrior(
             pivot=np.ascontiguousarray(knowledge.pivot_enu_m),
             pivot_info=pivot_info,
             commanded_rot=np.ascontiguousarray(knowledge.commanded_rot),
@@ -514,21 +514,23 @@ class Fit:
             clock_info=clock_info,
         )
 
-    def run(self, prepared: _Prepared, state: State, rows: IntArray, common: Common, told: Told | None = None) -> State:
+    def run(
+        self, prepared: _Prepared, state: FitState, rows: IntArray, common: Common, told: FactorShares | None = None
+    ) -> FitState:
         """Fit some mirrors from where they stand; the others stay."""
         out = state.copy()
         out.scale[rows] = 1.0
         for values in (out.weight, out.residual, out.sigma):
             values[rows] = np.nan
-        told = Told.of(0) if told is None else told
+        told = FactorShares.of(0) if told is None else told
         _kernels.fit_mirrors(
             len(rows),
             rows,
             self._links,
             prepared.heard(self.settings, common),
             self._prior,
-            _kernels.Law(common.floor, common.tail, self._own_scale, self._max_steps),
-            _kernels.Ended(
+            _kernels.StrayLaw(common.floor, common.tail, self._own_scale, self._max_steps),
+            _kernels.SiteFits(
                 out.pivot, out.rot, out.cov, out.weight, out.residual, out.sigma, out.scale, out.total, out.dof,
                 out.cost, out.steps, told.factor, told.soil,
             ),
@@ -540,7 +542,7 @@ class Fit:
         """Sort rays as the kernel wants them."""
         return _Prepared.of(voltages, self.seen.carrier.shape, self.known.mast)
 
-    def learn(self, voltages: Voltages, state: State, rows: IntArray, common: Common) -> Common:
+    def learn(self, voltages: Voltages, state: FitState, rows: IntArray, common: Common) -> Common:
         """Return what mirrors' residuals say of what all have in common (restricted maximum likelihood)."""
         prepared = self.prepare(voltages)
         best, chosen = self._learn_with(prepared, state, rows, common)
@@ -558,8 +560,8 @@ class Fit:
                 break
         return chosen
 
-    def _learn_with(self, prepared: _Prepared, state: State, rows: IntArray, common: Common) -> tuple[float, Common]:
-        told = Told.of(len(state.cost))
+    def _learn_with(self, prepared: _Prepared, state: FitState, rows: IntArray, common: Common) -> tuple[float, Common]:
+        told = FactorShares.of(len(state.cost))
         for _ in range(_LEARN_ROUNDS):
             state = self.run(prepared, state, rows, common, told)
             last, common = common, self._learned(state, told, rows, common)
@@ -570,7 +572,7 @@ class Fit:
         total = float(np.nansum(cost)) if np.isfinite(cost).any() else np.inf
         return total, self.with_soil(told, rows, common)
 
-    def _learned(self, state: State, told: Told, rows: IntArray, common: Common) -> Common:
+    def _learned(self, state: FitState, told: FactorShares, rows: IntArray, common: Common) -> Common:
         total, dof = state.total[rows], state.dof[rows]
         ended = np.isfinite(total) & (dof > 0.0)
         if not ended.any():
@@ -586,7 +588,7 @@ class Fit:
         scale = np.clip(common.factor_scale * change, _LEAST_FACTOR_SCALE, 1.0 / _LEAST_FACTOR_SCALE)
         return replace(common, floor=max(floor, self.settings.least_floor), factor_scale=scale)
 
-    def with_soil(self, told: Told, rows: IntArray, given: Common) -> Common:
+    def with_soil(self, told: FactorShares, rows: IntArray, given: Common) -> Common:
         """Join what mirrors say of the ground's permittivity, each about the mean that was given."""
         estimate, share = np.moveaxis(np.nan_to_num(told.soil[rows]), 2, 0)
         share = np.clip(share, 0.0, 1.0 - 1e-9)
@@ -601,7 +603,7 @@ class Fit:
             given, soil_change=given.soil_change + complex(*change), soil_sigma=(float(left[0]), float(left[1]))
         )
 
-    def outcome(self, state: State, known: BoolArray, common: Common) -> SitePoses:
+    def outcome(self, state: FitState, known: BoolArray, common: Common) -> SitePoses:
         """Return what was found, with reasons where nothing was."""
         from scipy.special import fdtri
 
@@ -665,7 +667,7 @@ def _redundancy(weight: FloatArray) -> IntArray:
     return np.asarray(used.sum(axis=(1, 2)) - used.any(axis=1).sum(axis=1) - 6)
 
 
-def _of_all_starts(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, common: Common) -> State:
+def _of_all_starts(fit: SiteFit, field_at: FieldAt, state: FitState, rows: IntArray, common: Common) -> FitState:
     """Begin from elsewhere, too, where wavelengths are short beside what postures are off by; keep the best."""
     knowledge = fit.known
     finite = knowledge.posture_sigma_rad[np.isfinite(knowledge.posture_sigma_rad)]
@@ -684,7 +686,7 @@ def _of_all_starts(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, co
     return state
 
 
-def _of_all_rolls(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, common: Common) -> State:
+def _of_all_rolls(fit: SiteFit, field_at: FieldAt, state: FitState, rows: IntArray, common: Common) -> FitState:
     """Begin from elsewhere, too, where mirrors lie nearly flat, so that their roll is hardly known; keep the best."""
     knowledge = fit.known
     roll = roll_sigma_rad_of(knowledge)
@@ -706,8 +708,8 @@ def _of_all_rolls(fit: Fit, field_at: FieldAt, state: State, rows: IntArray, com
 
 
 def _from(
-    fit: Fit, field_at: FieldAt, near: _Prepared, start: State, state: State, rows: IntArray, common: Common
-) -> State:
+    fit: SiteFit, field_at: FieldAt, near: _Prepared, start: FitState, state: FitState, rows: IntArray, common: Common
+) -> FitState:
     """Fit some mirrors from another start; return what stood, with what is better, and what is as good marked."""
     apart_rad = _APART * _wavelength_m(fit) / _lever_m(fit)
     found = fit.run(near, start, rows, common)
@@ -726,11 +728,11 @@ def _from(
     return replace(state, ambiguous=ambiguous)
 
 
-def _lever_m(fit: Fit) -> float:
+def _lever_m(fit: SiteFit) -> float:
     return max(float(np.nanmax(np.linalg.norm(fit.known.receiver_mirror_m, axis=-1), initial=0.0)), 1e-9)
 
 
-def _wavelength_m(fit: Fit) -> float:
+def _wavelength_m(fit: SiteFit) -> float:
     return 2.0 * np.pi / float(fit.seen.wavenumber_radpm.max())
 
 
@@ -768,13 +770,13 @@ class _Prepared:
         order = np.lexsort((group, mirror))
         return cls(voltages, np.asarray(order, np.int64), np.asarray(group, np.int64), link_of)
 
-    def heard(self, settings: SiteSettings, common: Common) -> _kernels.Heard:
+    def heard(self, settings: SiteSettings, common: Common) -> _kernels.VoltageArrays:
         """Return what the kernel takes."""
         voltages, rays = self.voltages, self.voltages.rays
         sigma = np.array([settings.factor_sigma.get(kind, (0.0, 0.0)) for kind in RayKind])
         amplitude, phase = (sigma * common.factor_scale[:, None])[rays.kind].T
         exact = (amplitude == 0.0) & (phase == 0.0)
-        return _kernels.Heard(
+        return _kernels.VoltageArrays(
             first=rays.first, link_of=self.link_of, source=rays.source_enu_m, place=rays.place_mirror_m,
             extra=rays.extra_m, voltage=voltages.voltage, slope=voltages.slope, soil_slope=voltages.soil_slope,
             vague=voltages.vague, kind=rays.kind, order=self.order, group=np.where(exact, -1, self.group),

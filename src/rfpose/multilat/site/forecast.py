@@ -18,14 +18,14 @@ from rfpose.geometry import cross_matrix
 from rfpose.multilat.site.fit import (
     MAX_STEPS,
     Common,
+    FactorShares,
     FieldAt,
-    Fit,
+    FitState,
+    SiteFit,
     SiteKnowledge,
     SiteObservations,
     SitePoses,
     SiteSettings,
-    State,
-    Told,
     Voltages,
     carrier_likeness,
     field_of,
@@ -35,7 +35,7 @@ from rfpose.multilat.site.fit import (
 )
 from rfpose.propagation import RayKind
 
-__all__ = ["SOURCES", "Disturbance", "ForeseenMirrors", "forecast_site"]
+__all__ = ["SOURCES", "ForeseenMirrors", "WorldErrors", "forecast_site"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -69,7 +69,7 @@ _FACTORS = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbance:
+class WorldErrors:
     """How the world differs from what the fit takes it for; zeros by default.
 
     Attributes
@@ -101,9 +101,9 @@ class Disturbance:
     pivot_m: FloatArray | float = 0.0
     posture_rad: FloatArray | float = 0.0
 
-    def __add__(self, other: Disturbance) -> Disturbance:
+    def __add__(self, other: WorldErrors) -> WorldErrors:
         """Return both at once."""
-        return Disturbance(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
+        return WorldErrors(**{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,14 +155,14 @@ class ForeseenMirrors:
         chosen = settings or SiteSettings()
         known, everyone, some = known_mirrors(knowledge)
         common = given_common(chosen)
-        voltages = field_of(field_at, State.begin(knowledge), everyone, common)
+        voltages = field_of(field_at, FitState.begin(knowledge), everyone, common)
         link = np.repeat(np.arange(len(voltages.rays.first) - 1), np.diff(voltages.rays.first))
         mirrors = cls(
             sigma=sigma, wavenumber_radpm=wavenumber_radpm, knowledge=knowledge, settings=chosen, voltages=voltages,
             common=common, _link=link,
         )  # fmt: skip
-        fit, told = mirrors._fit(mirrors.received()), Told.of(len(known))
-        fit.run(fit.prepare(voltages), State.begin(knowledge), some, common, told)
+        fit, told = mirrors._fit(mirrors.received()), FactorShares.of(len(known))
+        fit.run(fit.prepare(voltages), FitState.begin(knowledge), some, common, told)
         return replace(mirrors, common=fit.with_soil(told, some, common))
 
     def poses(self) -> SitePoses:
@@ -170,7 +170,7 @@ class ForeseenMirrors:
         fit = self._fit(self.received())
         known, everyone, _ = known_mirrors(self.knowledge)
         # one step from the truth: residuals are zero, so that links keep the weight that they have on average
-        state = fit.run(fit.prepare(self.voltages), State.begin(self.knowledge), everyone, self.common)
+        state = fit.run(fit.prepare(self.voltages), FitState.begin(self.knowledge), everyone, self.common)
         return fit.outcome(state, known, self.common)
 
     def share(self, source: str) -> FloatArray:
@@ -178,9 +178,9 @@ class ForeseenMirrors:
         more, less = (self._scaled(source, 1.0 + sign * _STEP).poses().normal_cov for sign in (1.0, -1.0))
         return np.asarray((more - less) / (2.0 * _STEP))
 
-    def received(self, disturbance: Disturbance | None = None) -> ComplexArray:
+    def received(self, disturbance: WorldErrors | None = None) -> ComplexArray:
         """(mirror, receiver, transmitter) sum of the rays in a world that is disturbed; NaN where there is none."""
-        off = disturbance or Disturbance()
+        off = disturbance or WorldErrors()
         shape = self.sigma.shape
         rays, link = self.voltages.rays, self._link
         at_receiver, transmitter = np.divmod(link, shape[2])
@@ -201,7 +201,7 @@ class ForeseenMirrors:
         below = self.voltages.rays.kind == RayKind.GROUND
         return np.asarray(np.where(below[:, None], shift * [1.0, 1.0, -1.0], shift))
 
-    def normal_change(self, disturbance: Disturbance, *, linear: bool) -> FloatArray:
+    def normal_change(self, disturbance: WorldErrors, *, linear: bool) -> FloatArray:
         """Return solved less true normals (mirror, xyz) in a disturbed world; NaN where a fit failed.
 
         Parameters
@@ -218,17 +218,17 @@ class ForeseenMirrors:
             commanded_rot=_turned(known.commanded_rot, np.broadcast_to(off.posture_rad, known.pivot_enu_m.shape)),
         )
         fit = self._fit(self.received(off), knowledge=told, max_steps=1 if linear else MAX_STEPS)
-        state = fit.run(fit.prepare(self.voltages), State.begin(known), everyone, self.common)
+        state = fit.run(fit.prepare(self.voltages), FitState.begin(known), everyone, self.common)
         ended = (state.steps >= 0) & (linear | (state.steps < MAX_STEPS))
         return np.asarray(np.where(ended[:, None], state.rot[:, :, 2] - known.commanded_rot[:, :, 2], np.nan))
 
-    def drawn(self, source: str, rng: np.random.Generator) -> Disturbance:
+    def drawn(self, source: str, rng: np.random.Generator) -> WorldErrors:
         """Return what one of `SOURCES` may do, drawn at random; zeros where it does nothing."""
         return _DRAWS.get(source, _draw_factor)(self, source, rng)
 
-    def _fit(self, carrier: ComplexArray, *, knowledge: SiteKnowledge | None = None, max_steps: int = 1) -> Fit:
+    def _fit(self, carrier: ComplexArray, *, knowledge: SiteKnowledge | None = None, max_steps: int = 1) -> SiteFit:
         observed = SiteObservations(carrier=carrier, sigma=self.sigma, wavenumber_radpm=self.wavenumber_radpm)
-        return Fit(observed, knowledge or self.knowledge, self.settings, max_steps=max_steps)
+        return SiteFit(observed, knowledge or self.knowledge, self.settings, max_steps=max_steps)
 
     def _scaled(self, source: str, variance: float) -> ForeseenMirrors:
         """Return it with one source's variance so many times as large."""
@@ -299,30 +299,30 @@ def _complex(rng: np.random.Generator, shape: tuple[int, ...]) -> ComplexArray:
     return np.asarray(real + 1j * imaginary)
 
 
-def _draw_noise(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
-    return Disturbance(stray=mirrors.sigma * _complex(rng, mirrors.sigma.shape))
+def _draw_noise(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
+    return WorldErrors(stray=mirrors.sigma * _complex(rng, mirrors.sigma.shape))
 
 
-def _draw_floor(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_floor(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     shape, nu = mirrors.sigma.shape, mirrors.common.tail
     heavy = np.sqrt(nu / rng.chisquare(nu, shape))
     strength = mirrors.common.floor * mirrors.knowledge.unit_field[:, None]
     together = carrier_likeness(mirrors.wavenumber_radpm, mirrors.knowledge.mast, mirrors.settings.detour_m)
     drawn = _complex(rng, shape) @ np.linalg.cholesky(together + 1e-9 * np.eye(shape[2])).T
-    return Disturbance(stray=np.asarray(strength * heavy * drawn, np.complex128))
+    return WorldErrors(stray=np.asarray(strength * heavy * drawn, np.complex128))
 
 
-def _draw_pattern(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_pattern(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     sigma = np.sqrt(mirrors.voltages.vague).reshape(mirrors.sigma.shape)
-    return Disturbance(stray=sigma * _complex(rng, mirrors.sigma.shape))
+    return WorldErrors(stray=sigma * _complex(rng, mirrors.sigma.shape))
 
 
-def _draw_permittivity(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_permittivity(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     real, imaginary = rng.standard_normal(2) * mirrors.common.soil_sigma
-    return Disturbance(factor=mirrors.voltages.soil_slope * complex(real, imaginary))
+    return WorldErrors(factor=mirrors.voltages.soil_slope * complex(real, imaginary))
 
 
-def _draw_factor(mirrors: ForeseenMirrors, source: str, rng: np.random.Generator) -> Disturbance:
+def _draw_factor(mirrors: ForeseenMirrors, source: str, rng: np.random.Generator) -> WorldErrors:
     kind, rays, shape = _FACTORS[source], mirrors.voltages.rays, mirrors.sigma.shape
     amplitude, phase = np.array(mirrors.settings.factor_sigma.get(kind, (0.0, 0.0)))
     scale = mirrors.common.factor_scale[kind]
@@ -341,40 +341,40 @@ def _draw_factor(mirrors: ForeseenMirrors, source: str, rng: np.random.Generator
     error = scale * (amplitude * rng.standard_normal(n) + 1j * phase * rng.standard_normal(n))
     factor = np.zeros(rays.n_ray, np.complex128)
     factor[mine] = error[same.ravel()]
-    return Disturbance(factor=factor)
+    return WorldErrors(factor=factor)
 
 
-def _draw_pivot(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_pivot(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     known = mirrors.knowledge
-    return Disturbance(pivot_m=known.pivot_sigma_m * rng.standard_normal(known.pivot_enu_m.shape))
+    return WorldErrors(pivot_m=known.pivot_sigma_m * rng.standard_normal(known.pivot_enu_m.shape))
 
 
-def _draw_posture(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_posture(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     known = mirrors.knowledge
     sigma = np.where(np.isfinite(known.posture_sigma_rad), known.posture_sigma_rad, 0.0)
     turn = sigma[:, None] * rng.standard_normal(known.pivot_enu_m.shape)
     normal = known.commanded_rot[:, :, 2]
     # across the normal: about it the mount holds the mirror
-    return Disturbance(posture_rad=turn - (turn * normal).sum(axis=1)[:, None] * normal)
+    return WorldErrors(posture_rad=turn - (turn * normal).sum(axis=1)[:, None] * normal)
 
 
-def _draw_roll(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_roll(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     known = mirrors.knowledge
     if not np.isfinite(known.roll_sigma_rad):
-        return Disturbance()
+        return WorldErrors()
     steep = np.maximum(np.abs(known.commanded_rot[:, 2, 1]), 1e-9)
     turn = np.minimum(known.roll_sigma_rad / steep, roll_sigma_rad_of(known)) * rng.standard_normal(len(steep))
     # receivers that turn about the normal leave it where it is
-    return Disturbance(place_m=np.cross([0.0, 0.0, 1.0], known.receiver_mirror_m) * turn[:, None, None])
+    return WorldErrors(place_m=np.cross([0.0, 0.0, 1.0], known.receiver_mirror_m) * turn[:, None, None])
 
 
-def _draw_clock(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> Disturbance:
+def _draw_clock(mirrors: ForeseenMirrors, _: str, rng: np.random.Generator) -> WorldErrors:
     sigma = mirrors.knowledge.clock_sigma_m
     delay = rng.standard_normal(mirrors.sigma.shape[:2])
-    return Disturbance(delay_m=(sigma if np.isfinite(sigma) else 0.0) * delay)
+    return WorldErrors(delay_m=(sigma if np.isfinite(sigma) else 0.0) * delay)
 
 
-_DRAWS: dict[str, Callable[[ForeseenMirrors, str, np.random.Generator], Disturbance]] = {
+_DRAWS: dict[str, Callable[[ForeseenMirrors, str, np.random.Generator], WorldErrors]] = {
     "noise": _draw_noise,
     "floor": _draw_floor,
     "pattern": _draw_pattern,

@@ -41,9 +41,9 @@ from rfpose.propagation import RayKind
 
 __all__ = [
     "CASES",
-    "Constants",
     "ReferencePoses",
     "Survey",
+    "SurveyConstants",
     "SurveyPrior",
     "lever_to_turn",
     "survey_site",
@@ -66,7 +66,7 @@ _REFERENCE_RAD = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Constants:
+class SurveyConstants:
     """What does not change.
 
     Attributes
@@ -126,7 +126,7 @@ class ReferencePoses:
     sigma_rad: FloatArray
 
 
-FieldFor = Callable[[Constants], FieldAt]
+FieldFor = Callable[[SurveyConstants], FieldAt]
 """From constants to what mirrors would receive with them."""
 
 
@@ -167,7 +167,7 @@ class Survey:
     settled
     """
 
-    constants: Constants
+    constants: SurveyConstants
     cov: FloatArray
     prior_sigma_m: FloatArray
     transmitter_cov: FloatArray
@@ -229,7 +229,7 @@ CASES = ("before", "now", "one reference pose more", "one receiver surveyed")
 def survey_site(
     observations: SiteObservations,
     knowledge: SiteKnowledge,
-    given: Constants,
+    given: SurveyConstants,
     field_for: FieldFor,
     *,
     prior: SurveyPrior,
@@ -319,7 +319,7 @@ class _System:
         self,
         observations: SiteObservations,
         knowledge: SiteKnowledge,
-        given: Constants,
+        given: SurveyConstants,
         prior: SurveyPrior,
         reference: ReferencePoses | None,
     ) -> None:
@@ -338,21 +338,21 @@ class _System:
         self.n_own = len(self.prior_sigma)
         self.n_all = self.n_mirror * self.n_own + 3 * self.n_tx
 
-    def constants(self, change: FloatArray) -> Constants:
+    def constants(self, change: FloatArray) -> SurveyConstants:
         """Return the constants that differ from the given ones by so many prior sigmas."""
         own = change[: self.n_mirror * self.n_own].reshape(self.n_mirror, self.n_own) * self.prior_sigma
         n = 3 * self.n_rx
         given = self.given
         delay = given.delay_m + own[:, n + 3 :] if self.surveys_delays else given.delay_m
         moved = (change[self.n_mirror * self.n_own :] * self.transmitter_sigma).reshape(self.n_tx, 3)
-        return Constants(
+        return SurveyConstants(
             receiver_mirror_m=given.receiver_mirror_m + own[:, :n].reshape(self.n_mirror, self.n_rx, 3),
             pivot_enu_m=given.pivot_enu_m + own[:, n : n + 3],
             transmitter_enu_m=given.transmitter_enu_m + moved,
             delay_m=delay,
         )
 
-    def fit(self, now: Constants, field_at: FieldAt, settings: SiteSettings) -> tuple[SitePoses, Voltages]:
+    def fit(self, now: SurveyConstants, field_at: FieldAt, settings: SiteSettings) -> tuple[SitePoses, Voltages]:
         """Fit poses with these constants, and return what would be received there."""
         n_frame = len(self.seen.carrier) // self.n_mirror
         wave = self.seen.wavenumber_radpm
@@ -621,7 +621,14 @@ class _Linear:
         return np.concatenate([nuisance, more]), np.concatenate([rest, told])
 
     def _transmitter_slope(
-        self, begin: int, end: int, part: ComplexArray, pivot: FloatArray, rot: FloatArray, now: Constants, n_link: int
+        self,
+        begin: int,
+        end: int,
+        part: ComplexArray,
+        pivot: FloatArray,
+        rot: FloatArray,
+        now: SurveyConstants,
+        n_link: int,
     ) -> ComplexArray:
         """(link, xyz) change of what is received by a shift of its transmitter.
 

@@ -19,12 +19,12 @@ import tomli_w
 from rfpose import __version__
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.feedback.calibrated import Known, ParameterChoice, resolve_free
+from rfpose.feedback.calibrated import KnownMount, ParameterChoice, resolve_free
 from rfpose.feedback.mount import Actuator, Mount
 from rfpose.files import claim
 from rfpose.foreign import load_json, load_toml
 from rfpose.kinds import told_kind
-from rfpose.sun import Site, site_from_degrees
+from rfpose.sun import Location, site_from_degrees
 
 __all__ = ["MODEL_FORMAT", "MODEL_VERSION", "MountFile", "StoredMount", "read_models", "write_model_file"]
 
@@ -88,15 +88,15 @@ class MountFile:
     """
 
     heliostats: Mapping[str, StoredMount]
-    site: Site | None = None
+    site: Location | None = None
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
 
 def write_model_file(
     path: str | Path,
-    heliostats: Mapping[str, Known],
+    heliostats: Mapping[str, KnownMount],
     *,
-    site: Site | None = None,
+    site: Location | None = None,
     settings: Mapping[str, Any] | None = None,
     undetermined: Mapping[str, tuple[tuple[str, ...], ...]] | None = None,
     force: bool = False,
@@ -144,7 +144,7 @@ def write_model_file(
         job.write(path, text.encode())
 
 
-def _as_table(known: Known, undetermined: tuple[tuple[str, ...], ...]) -> dict[str, Any]:
+def _as_table(known: KnownMount, undetermined: tuple[tuple[str, ...], ...]) -> dict[str, Any]:
     mount = known.mount
     table: dict[str, Any] = {
         "pivot_enu_m": mount.pivot_enu_m.tolist(),
@@ -307,7 +307,7 @@ def _stored_choice(table: Any, free: tuple[str, ...]) -> ParameterChoice | None:
     )
 
 
-def _site(path: Path, table: Any) -> Site | None:
+def _site(path: Path, table: Any) -> Location | None:
     if table is None:
         return None
     try:

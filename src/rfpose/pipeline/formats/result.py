@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp import PhaseCalibration, TonePhases
 from rfpose.errors import InvalidInputError
 from rfpose.foreign import exact_number
 from rfpose.multilat import RangeDifferences
@@ -306,7 +306,7 @@ class Result(Shown):
     settings: Mapping[str, str]
     frame_start_index: npt.NDArray[np.int64]
     tones: TonePhases
-    calibration: Calibration
+    calibration: PhaseCalibration
     ranges: RangeDifferences
     fixes: FixTable
     poses: PoseTable

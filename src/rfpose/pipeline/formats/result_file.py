@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.dsp import Calibration, CalibrationStatus, LineStatus, TonePhases
+from rfpose.dsp import CalibrationStatus, LineStatus, PhaseCalibration, TonePhases
 from rfpose.errors import InvalidInputError, RfposeError
 from rfpose.files import write_atomically
 from rfpose.kinds import kind_of
@@ -337,7 +337,7 @@ class _Reader(FileReader):
                 tone_hz=scenario.tone_hz,
                 frame_start_index=start_index,
             ),
-            calibration=Calibration(**self._group("calibration")),
+            calibration=PhaseCalibration(**self._group("calibration")),
             ranges=RangeDifferences(**self._group("ranges")),
             fixes=FixTable(**self._group("fixes")),
             poses=PoseTable(**self._group("poses")),

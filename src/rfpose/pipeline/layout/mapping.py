@@ -14,7 +14,7 @@ from rfpose.drawing import WIDTH_INCH, angle_unit, new_figure
 from rfpose.errors import ScenarioError
 from rfpose.layout import maps
 from rfpose.layout.budget import noise_bound, working_point
-from rfpose.layout.maps import ESTIMATORS, Study, summarise
+from rfpose.layout.maps import ESTIMATORS, NormalsStudy, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
 from rfpose.measurement import SCENARIO, first_snr
@@ -376,7 +376,7 @@ def _some(n_posture: int) -> list[int]:
     return [int(k) for k in np.linspace(0, n_posture - 1, _MOST_LOST_POSTURES).round()]
 
 
-def _without_each(study: Study, postures: list[FieldPosture], seen: list[BoolArray] | None) -> FloatArray:
+def _without_each(study: NormalsStudy, postures: list[FieldPosture], seen: list[BoolArray] | None) -> FloatArray:
     """Rms over field and postures with each transmitter lost (transmitter,) [mrad]; with sight, of what is left."""
     sigma = np.concatenate(
         [

@@ -15,7 +15,7 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.files import write_atomically
 from rfpose.layout import maps
 from rfpose.layout import optimise as search
-from rfpose.layout.maps import Mirrors
+from rfpose.layout.maps import PosedMirrors
 from rfpose.layout.optimise import (
     Constraints,
     Costs,
@@ -159,7 +159,7 @@ def _half_m(mirror: Heliostat) -> float:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class TowerShade:
     """What towers do to mirrors' light.
 
     Attributes
@@ -178,7 +178,7 @@ class Standing:
 _SHADE_M = 1000.0
 
 
-def _standing(scenario: Scenario, suns: Sequence[FloatArray]) -> Standing:
+def _standing(scenario: Scenario, suns: Sequence[FloatArray]) -> TowerShade:
     lines, tower, pivot = sightlines(scenario), scenario.transmitter_enu_m, scenario.pivot_enu_m
     half = _MAST_M + max(_half_m(mirror) for mirror in scenario.heliostat)
     shaded = 0
@@ -186,7 +186,7 @@ def _standing(scenario: Scenario, suns: Sequence[FloatArray]) -> Standing:
         way = Sightlines(start_enu_m=pivot, end_enu_m=pivot + _SHADE_M * sun, clearance_m=half)
         shaded += way.crossed(tower)
     crossed = None if lines is None else lines.crossed(tower)
-    return Standing(crossed=crossed, shaded=shaded, mirror_suns=len(suns) * len(pivot))
+    return TowerShade(crossed=crossed, shaded=shaded, mirror_suns=len(suns) * len(pivot))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -217,8 +217,8 @@ class SitePlacement(Shown):
     before_pdop: float
     after_pdop: float
     without_sight: float | None
-    standing_before: Standing
-    standing: Standing
+    standing_before: TowerShade
+    standing: TowerShade
 
     def as_dict(self) -> dict[str, Any]:
         """Return the placement with stable keys; angles in mrad of the normal."""
@@ -337,7 +337,7 @@ class _Task:
 
     scenario: Scenario
     postures: tuple[FieldPosture, ...]
-    field: Mirrors
+    field: PosedMirrors
     constraints: Constraints
     suns: tuple[FloatArray, ...]
     keep: int

@@ -20,11 +20,11 @@ from rfpose.geometry import (
     unit,
 )
 from rfpose.layout import maps
-from rfpose.layout.maps import Mirrors
+from rfpose.layout.maps import PosedMirrors
 from rfpose.layout.sight import Plates, Tower
 from rfpose.multilat import check_unambiguous
 from rfpose.scenario import Scenario, naming, scenario_of
-from rfpose.sun import Site as SunSite
+from rfpose.sun import Location as SunSite
 from rfpose.sun import sun_position
 
 __all__ = [
@@ -89,7 +89,7 @@ class FieldPosture:
     """
 
     name: str
-    mirrors: Mirrors
+    mirrors: PosedMirrors
     plate_rot: FloatArray
 
 
@@ -199,12 +199,12 @@ def _suns_of_day(scenario: Scenario, day: date, step_min: int) -> list[tuple[str
     ]
 
 
-def stacked(postures: Sequence[Mirrors]) -> Mirrors:
+def stacked(postures: Sequence[PosedMirrors]) -> PosedMirrors:
     """Return one field of all postures, posture by posture."""
     n = len(postures[0].pivot_enu_m)
     places = [np.broadcast_to(m.receiver_mirror_m, (n, *m.receiver_mirror_m.shape[1:])) for m in postures]
     alike = len(postures[0].receiver_mirror_m) == 1
-    return Mirrors(
+    return PosedMirrors(
         pivot_enu_m=np.concatenate([m.pivot_enu_m for m in postures]),
         rot_enu_from_mirror=np.concatenate([m.rot_enu_from_mirror for m in postures]),
         receiver_mirror_m=postures[0].receiver_mirror_m if alike else np.concatenate(places),

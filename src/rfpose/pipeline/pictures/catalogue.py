@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rfpose.pipeline.pictures.track_view import TrackPicture
     from rfpose.recording import Recording
 
-__all__ = ["FIGURES", "FigureChoice", "Opened", "draw", "opened_file"]
+__all__ = ["FIGURES", "FigureChoice", "OpenedFile", "draw", "opened_file"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class FigureChoice:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Opened:
+class OpenedFile:
     """A file that figures are drawn of: of one kind, with the site that belongs to it."""
 
     path: Path
@@ -71,7 +71,7 @@ def opened_file(
     truth: str | Path | None = None,
     scenario: str | Path | None = None,
     follow_links: bool = False,
-) -> Iterator[Opened]:
+) -> Iterator[OpenedFile]:
     """Open a result, tracking run, recording or scenario for the block.
 
     Parameters
@@ -94,7 +94,7 @@ def opened_file(
         from rfpose.pipeline.formats.result_file import open_result
 
         result = open_result(path)
-        yield Opened(
+        yield OpenedFile(
             path=path, kind=kind, scenario=result.scenario, result=result,
             evaluation=_evaluation(result, truth, follow_links=follow_links),
         )  # fmt: skip
@@ -103,15 +103,15 @@ def opened_file(
         from rfpose.pipeline.pictures.track_view import picture_of_track, site_of_run
 
         picture = picture_of_track(open_track(path))
-        yield Opened(path=path, kind=kind, scenario=site_of_run(picture.track), track=picture)
+        yield OpenedFile(path=path, kind=kind, scenario=site_of_run(picture.track), track=picture)
     elif kind == "scenario" or (kind is None and path.suffix == ".toml"):
-        yield Opened(path=path, kind="scenario", scenario=load_scenario(path))
+        yield OpenedFile(path=path, kind="scenario", scenario=load_scenario(path))
     else:
         from rfpose.recording import open_recording
 
         given = None if scenario is None else load_scenario(scenario)
         with open_recording(path, scenario=given, follow_links=follow_links) as recording:
-            yield Opened(path=path, kind="recording", scenario=recording.scenario, recording=recording)
+            yield OpenedFile(path=path, kind="recording", scenario=recording.scenario, recording=recording)
 
 
 def _evaluation(result: Result, truth: str | Path | None, *, follow_links: bool) -> Evaluation | None:
@@ -125,7 +125,7 @@ def _evaluation(result: Result, truth: str | Path | None, *, follow_links: bool)
         return None
 
 
-def draw(file: Opened, what: str | None = None, choice: FigureChoice | None = None) -> Figure:
+def draw(file: OpenedFile, what: str | None = None, choice: FigureChoice | None = None) -> Figure:
     """Draw a figure of a file, by default the first that there is of its kind.
 
     Raises
@@ -145,7 +145,7 @@ def draw(file: Opened, what: str | None = None, choice: FigureChoice | None = No
     return drawer(file, choice)
 
 
-def _heliostat(file: Opened, choice: FigureChoice) -> int | None:
+def _heliostat(file: OpenedFile, choice: FigureChoice) -> int | None:
     if choice.heliostat is None:
         return None
     ids = file.heliostat_ids
@@ -155,7 +155,7 @@ def _heliostat(file: Opened, choice: FigureChoice) -> int | None:
     return ids.index(choice.heliostat)
 
 
-def _map(file: Opened, choice: FigureChoice) -> Figure:
+def _map(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_field_map
 
     assert file.result is not None
@@ -165,28 +165,28 @@ def _map(file: Opened, choice: FigureChoice) -> Figure:
     )
 
 
-def _errors(file: Opened, _: FigureChoice) -> Figure:
+def _errors(file: OpenedFile, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_errors
 
     assert file.result is not None
     return draw_errors(file.result, evaluation=file.evaluation)
 
 
-def _links(file: Opened, _: FigureChoice) -> Figure:
+def _links(file: OpenedFile, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_links
 
     assert file.result is not None
     return draw_links(file.result)
 
 
-def _mirror(file: Opened, choice: FigureChoice) -> Figure:
+def _mirror(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.results import draw_mirror
 
     assert file.result is not None
     return draw_mirror(file.result, _heliostat(file, choice) or 0, frame=choice.frame)
 
 
-def _budget(file: Opened, _: FigureChoice) -> Figure:
+def _budget(file: OpenedFile, _: FigureChoice) -> Figure:
     from rfpose.pipeline.layout import budget
 
     assert file.scenario is not None
@@ -196,7 +196,7 @@ def _budget(file: Opened, _: FigureChoice) -> Figure:
     return budget(file.scenario, pose=pose, n_draw=0).plot()
 
 
-def _layout(file: Opened, _: FigureChoice) -> Figure:
+def _layout(file: OpenedFile, _: FigureChoice) -> Figure:
     from rfpose.pipeline.layout import layout_map
 
     if file.scenario is None:
@@ -213,47 +213,47 @@ def _estimator(result: Result | None) -> str:
     return result.choice.pose
 
 
-def _course(file: Opened, _: FigureChoice) -> Figure:
+def _course(file: OpenedFile, _: FigureChoice) -> Figure:
     assert file.track is not None
     return file.track.track.plot()
 
 
-def _methods(file: Opened, _: FigureChoice) -> Figure:
+def _methods(file: OpenedFile, _: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_methods
 
     assert file.track is not None
     return draw_methods(file.track.track)
 
 
-def _instant(file: Opened, choice: FigureChoice) -> Figure:
+def _instant(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_instant
 
     assert file.track is not None
     return draw_instant(file.track, method=choice.method, instant=choice.frame, chosen=_heliostat(file, choice))
 
 
-def _mirror_course(file: Opened, choice: FigureChoice) -> Figure:
+def _mirror_course(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.tracking import draw_mirror_course
 
     assert file.track is not None
     return draw_mirror_course(file.track, _heliostat(file, choice) or 0)
 
 
-def _spectrum(file: Opened, choice: FigureChoice) -> Figure:
+def _spectrum(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.recordings import draw_band
 
     assert file.recording is not None
     return draw_band(file.recording, receiver_id=choice.receiver, frame=choice.frame or 0)
 
 
-def _waterfall(file: Opened, choice: FigureChoice) -> Figure:
+def _waterfall(file: OpenedFile, choice: FigureChoice) -> Figure:
     from rfpose.pipeline.pictures.recordings import draw_waterfall
 
     assert file.recording is not None
     return draw_waterfall(file.recording, receiver_id=choice.receiver)
 
 
-_Drawer = Callable[[Opened, FigureChoice], "Figure"]
+_Drawer = Callable[[OpenedFile, FigureChoice], "Figure"]
 
 FIGURES: Mapping[str, Mapping[str, tuple[tuple[str, ...], _Drawer]]] = {
     "result": {

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
-from rfpose.dsp import Calibration, FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases, calibrate
+from rfpose.dsp import FrameTones, LinePlan, LineStatus, PhaseCalibration, ToneExtractor, TonePhases, calibrate
 from rfpose.dsp.bank import LineBank
 from rfpose.dsp.calibration import wrap
 from rfpose.dsp.hilbert import analytic_tones, centred_streams
@@ -476,7 +476,7 @@ def _measured(
 
 
 def phases_of(
-    tones: TonePhases, calibration: Calibration | None, receiver_id: str, scenario: Scenario, *, first_index: int
+    tones: TonePhases, calibration: PhaseCalibration | None, receiver_id: str, scenario: Scenario, *, first_index: int
 ) -> PhaseTrack:
     """Return one receiver's phases over frames from what was measured before."""
     row = scenario.receiver_ids.index(receiver_id)

@@ -19,7 +19,7 @@ from rfpose.scenario.tracking import Event
 __all__ = [
     "MODES",
     "ON_RECEIVER",
-    "Happening",
+    "FieldHappening",
     "Instant",
     "TrackPicture",
     "clock",
@@ -49,7 +49,7 @@ _NAMED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Happening:
+class FieldHappening:
     """Something that happened to the field of one method.
 
     Attributes
@@ -143,7 +143,7 @@ class TrackPicture:
     time: tuple[str, ...]
     rms_mrad: Mapping[str, FloatArray]
     flux: Mapping[str, FloatArray]
-    happened: Mapping[str, tuple[Happening, ...]]
+    happened: Mapping[str, tuple[FieldHappening, ...]]
     pivot_enu_m: FloatArray
     target_enu_m: FloatArray
     ids: tuple[str, ...]
@@ -177,7 +177,7 @@ class TrackPicture:
         count = self.track.methods[method].series["mode_count"]
         return {int(k): int(count[instant, k]) for k in np.flatnonzero(count.any(axis=0))}
 
-    def place_h(self, happening: Happening) -> float:
+    def place_h(self, happening: FieldHappening) -> float:
         """Return where on `hours` something happened; NaN: nowhere."""
         first = int(np.argmax(self.track.day == happening.day))
         return float(self.hours[first]) + happening.hour - float(local_hour(self.track)[first])
@@ -360,9 +360,9 @@ def groups(places: Sequence[float], least: float) -> list[list[int]]:
     return found
 
 
-def what_happened(track: Track, method: str) -> tuple[Happening, ...]:
+def what_happened(track: Track, method: str) -> tuple[FieldHappening, ...]:
     """Return what happened to a method's field, in the order of days and hours; empty without field control."""
-    found: list[Happening] = []
+    found: list[FieldHappening] = []
     for day, report in enumerate(track.methods[method].happened):
         agenda = [event for event in track.scenario.tracking.event if event.day in (None, day + 1)]
         timed = [_event(day, entry, agenda, len(track.heliostat_ids)) for entry in report["events"]]
@@ -373,7 +373,7 @@ def what_happened(track: Track, method: str) -> tuple[Happening, ...]:
     return tuple(found)
 
 
-def _event(day: int, entry: Mapping[str, Any], agenda: list[Event], n_mirror: int) -> Happening:
+def _event(day: int, entry: Mapping[str, Any], agenda: list[Event], n_mirror: int) -> FieldHappening:
     what, who = entry["what"].replace("-", " "), _who(entry, agenda, n_mirror)
     text = f"{what}: {who}" if who else str(what)
     refused: Mapping[str, int] = entry.get("refused", {})
@@ -381,7 +381,7 @@ def _event(day: int, entry: Mapping[str, Any], agenda: list[Event], n_mirror: in
         reasons = (f"{count} × {why.partition(' refused: ')[2] or why}" for why, count in refused.items())
         text += f"; refused: {', '.join(reasons)}"
     mark = f"{what} {who}" if who and len(who) <= 4 else str(what)
-    return Happening(day=day, hour=entry["hour"], kind="event", mark=mark, text=text, trouble=bool(refused))
+    return FieldHappening(day=day, hour=entry["hour"], kind="event", mark=mark, text=text, trouble=bool(refused))
 
 
 def _who(entry: Mapping[str, Any], agenda: list[Event], n_mirror: int) -> str:
@@ -401,7 +401,7 @@ def _mirrors(n: int) -> str:
     return "1 mirror" if n == 1 else f"{n} mirrors"
 
 
-def _alarm(day: int, entry: Mapping[str, Any]) -> Happening:
+def _alarm(day: int, entry: Mapping[str, Any]) -> FieldHappening:
     parts = []
     for key, what in (
         ("below_tenth_s", "flux below a tenth"),
@@ -413,14 +413,14 @@ def _alarm(day: int, entry: Mapping[str, Any]) -> Happening:
         parts.append(f"{what} after {after:.0f} s" if after is not None else f"{what}: not within half an hour")
     late = any(entry[key] is None for key in ("below_tenth_s", "off_s", "stowed_s"))
     text = f"alarm, {entry['alarm']}: {', '.join(parts)}"
-    return Happening(day=day, hour=entry["hour"], kind="alarm", mark=entry["alarm"], text=text, trouble=late)
+    return FieldHappening(day=day, hour=entry["hour"], kind="alarm", mark=entry["alarm"], text=text, trouble=late)
 
 
-def _calibration(day: int, entry: Mapping[str, Any]) -> Happening:
+def _calibration(day: int, entry: Mapping[str, Any]) -> FieldHappening:
     text = f"{entry['heliostat']} calibrated: {entry['outcome']}{' after a search' if entry['searched'] else ''}"
     if entry["offset_mm"] is not None:
         text += f", {np.hypot(*entry['offset_mm']):.0f} mm beside the middle"
-    return Happening(
+    return FieldHappening(
         day=day,
         hour=float("nan"),
         kind="calibration",
@@ -430,14 +430,14 @@ def _calibration(day: int, entry: Mapping[str, Any]) -> Happening:
     )
 
 
-def _messages(day: int, entry: Mapping[str, int]) -> Happening:
+def _messages(day: int, entry: Mapping[str, int]) -> FieldHappening:
     parts = []
     for key, what in (("sun", "sun angles"), ("question", "questions"), ("answer", "answers")):
         by_fate = {name.partition("_")[2]: n for name, n in entry.items() if name.startswith(f"{key}_")}
         missed = sum(by_fate.values()) - by_fate.get("ok", 0)
         parts.append(f"{100.0 * missed / max(sum(by_fate.values()), 1):.1f} % of {what}")
     refused, alone = entry["orders_refused"], entry["watchdog_emergencies"]
-    return Happening(
+    return FieldHappening(
         day=day,
         hour=float("nan"),
         kind="messages",

@@ -18,7 +18,7 @@ from rfpose.errors import InvalidInputError, PublishError, install_remedy
 from rfpose.pipeline.publish.address import address_of
 from rfpose.pipeline.publish.messages import SCHEMA
 
-__all__ = ["Broker", "Sent", "send"]
+__all__ = ["Broker", "SentMessages", "send"]
 
 _log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ class Broker:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sent:
+class SentMessages:
     """What became of messages.
 
     Attributes
@@ -136,7 +136,7 @@ def send(
     *,
     on_progress: Callable[[int, int], None] | None = None,
     n_message: int = 0,
-) -> Sent:
+) -> SentMessages:
     """Send messages to a broker, in their order, and wait until it has them.
 
     Parameters
@@ -216,11 +216,11 @@ class _Line:
             else:
                 self._on_their_way.add(told.mid)
 
-    def finished(self) -> Sent:
+    def finished(self) -> SentMessages:
         """Wait until the broker has all, or patience is over."""
         self._wait_for(lambda: not self._on_their_way)
         with self._lock:
-            return Sent(
+            return SentMessages(
                 acknowledged=self._acknowledged,
                 dropped=self._dropped,
                 unacknowledged=len(self._on_their_way),

@@ -11,7 +11,7 @@ from pathlib import Path
 from rfpose import __version__
 from rfpose.drawing import look, svg_of
 from rfpose.errors import InvalidInputError, RfposeError
-from rfpose.pipeline.pictures.catalogue import FigureChoice, Opened, draw, opened_file
+from rfpose.pipeline.pictures.catalogue import FigureChoice, OpenedFile, draw, opened_file
 from rfpose.pipeline.report import page
 from rfpose.pipeline.report.others import recording_parts, scenario_parts
 from rfpose.pipeline.report.results import mirror_table, result_parts
@@ -78,7 +78,7 @@ def report_html(
         return page.html(f"rfpose: {file.path.name}", [_head(file), *body])
 
 
-def _parts(file: Opened) -> tuple[str, list[str], Mapping[str, str]]:
+def _parts(file: OpenedFile) -> tuple[str, list[str], Mapping[str, str]]:
     """Return what was asked, tables, and settings."""
     if file.result is not None:
         return (*result_parts(file.result, file.evaluation), file.result.settings)
@@ -90,7 +90,7 @@ def _parts(file: Opened) -> tuple[str, list[str], Mapping[str, str]]:
     return (*scenario_parts(file.scenario), {})
 
 
-def _figures(file: Opened, choice: ReportChoice) -> list[tuple[str, FigureChoice, str]]:
+def _figures(file: OpenedFile, choice: ReportChoice) -> list[tuple[str, FigureChoice, str]]:
     """Return which figures are drawn: name, choice, caption; those of chosen mirrors last."""
     found: list[tuple[str, FigureChoice, str]]
     if file.result is not None:
@@ -124,7 +124,7 @@ def _figures(file: Opened, choice: ReportChoice) -> list[tuple[str, FigureChoice
     return found + [("mirror", FigureChoice(heliostat=name), "") for name in choice.heliostats]
 
 
-def _figure(file: Opened, what: str, choice: FigureChoice, caption: str, *, name: str) -> str:
+def _figure(file: OpenedFile, what: str, choice: FigureChoice, caption: str, *, name: str) -> str:
     """Return a figure in HTML; where it cannot be drawn, the reason."""
     try:
         with look("page"):
@@ -136,12 +136,12 @@ def _figure(file: Opened, what: str, choice: FigureChoice, caption: str, *, name
     return f"<figure>{drawn}<figcaption>{page.text(caption)}</figcaption></figure>"
 
 
-def _head(file: Opened) -> str:
+def _head(file: OpenedFile) -> str:
     site = "" if file.scenario is None else f" of {file.scenario.name}"
     return f"<h1>{page.text(file.path.name)}</h1><p class='m'>{page.text(file.kind + site)}; rfpose {__version__}</p>"
 
 
-def _ends(file: Opened, settings: Mapping[str, str]) -> str:
+def _ends(file: OpenedFile, settings: Mapping[str, str]) -> str:
     parts = ["<h2>Settings</h2>", page.facts(settings)] if settings else []
     parts += ["<h2>Versions</h2>", page.facts(_versions())]
     if file.scenario is not None:

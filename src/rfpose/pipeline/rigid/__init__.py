@@ -6,14 +6,14 @@ from fractions import Fraction
 
 import numpy as np
 
-from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp import PhaseCalibration, TonePhases
 from rfpose.multilat import RangeDifferences
 from rfpose.multilat.estimation import protected, without_vague
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import FixTable, PoseTable
 from rfpose.pipeline.mirrors import mirror_groups
 from rfpose.pipeline.rigid.inputs import RigidInputs, solve_group
-from rfpose.pipeline.rigid.tables import RigidOutcome, Tables
+from rfpose.pipeline.rigid.tables import RigidOutcome, RigidTables
 from rfpose.scenario import Scenario
 
 __all__ = ["RigidOutcome", "solve_rigid_poses"]
@@ -21,7 +21,7 @@ __all__ = ["RigidOutcome", "solve_rigid_poses"]
 
 def solve_rigid_poses(
     tones: TonePhases,
-    calibration: Calibration,
+    calibration: PhaseCalibration,
     ranges: RangeDifferences,
     fixes: FixTable,
     independent: PoseTable,
@@ -51,7 +51,7 @@ def solve_rigid_poses(
     stages = RigidInputs(
         tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice
     )
-    tables = Tables(stages, independent)
+    tables = RigidTables(stages, independent)
     start = tones.frame_start_index
     time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
     for group in mirror_groups(scenario):

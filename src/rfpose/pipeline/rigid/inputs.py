@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.dsp import Calibration, TonePhases
+from rfpose.dsp import PhaseCalibration, TonePhases
 from rfpose.dsp.calibration import frame_times, phase_average
 from rfpose.measurement import reflectors_of
 from rfpose.multilat import FixStatus, RangeDifferences
-from rfpose.multilat.estimation import Found, Reflections, solve_direct, solve_two_ray
+from rfpose.multilat.estimation import PoseEstimates, ReflectionModel, solve_direct, solve_two_ray
 from rfpose.multilat.integrity import Alarms
 from rfpose.multilat.rigid import MirrorProblem
 from rfpose.multilat.rigid.integers import align_points
@@ -31,7 +31,7 @@ class RigidInputs:
     """What the stages before found, and how to go on."""
 
     tones: TonePhases
-    calibration: Calibration
+    calibration: PhaseCalibration
     ranges: RangeDifferences
     fixes: FixTable
     scenario: Scenario
@@ -55,7 +55,7 @@ class RigidInputs:
         )
 
 
-def solve_group(inputs: RigidInputs, group: MirrorGroup) -> Found:
+def solve_group(inputs: RigidInputs, group: MirrorGroup) -> PoseEstimates:
     """Solve one group of mirrors by the chosen estimator."""
     problem = problem_of(inputs, group)
     if inputs.choice.reflection == "none":
@@ -64,7 +64,7 @@ def solve_group(inputs: RigidInputs, group: MirrorGroup) -> Found:
     row = np.arange(len(problem.range_m)).reshape(inputs.n_frame, -1)
     frame, heliostat = (index.ravel() for index in np.indices(row.shape))
     average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
-    reflections = Reflections(
+    reflections = ReflectionModel(
         reflectors=reflectors_of(scenario, inputs.choice.reflection),
         carrier_rf_hz=scenario.carrier_rf_hz,
         calibration=calibration_sight(average, scenario, frame),

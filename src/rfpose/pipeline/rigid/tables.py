@@ -11,7 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix
 from rfpose.multilat import FilterSettings, FilterStatus, PoseStatus, filter_poses
-from rfpose.multilat.estimation import Found
+from rfpose.multilat.estimation import PoseEstimates
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import IntegerMethod
@@ -37,7 +37,7 @@ class RigidOutcome:
     filtered: FilteredTable | None
 
 
-class Tables:
+class RigidTables:
     """The result's tables, filled group by group."""
 
     def __init__(self, stages: RigidInputs, independent: PoseTable) -> None:
@@ -83,7 +83,7 @@ class Tables:
                 "jumped": np.zeros(frame_mirror, np.bool_),
             }
 
-    def put(self, group: MirrorGroup, found: Found) -> None:
+    def put(self, group: MirrorGroup, found: PoseEstimates) -> None:
         """Write one group's poses and tests."""
         poses = found.poses
         normal = poses.normal_enu
@@ -131,13 +131,13 @@ class Tables:
             names = ("coefficient", "coefficient_sigma", "probability_direct")
             self._put(self._reflection, group, {name: getattr(found, name) for name in names})
 
-    def _methods(self, group: MirrorGroup, found: Found) -> IntArray:
+    def _methods(self, group: MirrorGroup, found: PoseEstimates) -> IntArray:
         """(mirror, clock) how integers were found; what a pose that failed rests on says nothing."""
         out = np.full((len(found.method), len(self._stages.scenario.tone) + 1), IntegerMethod.FLOAT, np.int64)
         out[:, : found.method.shape[1]] = np.where(np.isfinite(found.poses.tilt_sigma_rad)[:, None], found.method, 0)
         return out
 
-    def put_filtered(self, group: MirrorGroup, found: Found, time_s: FloatArray, *, exposure_s: float) -> None:
+    def put_filtered(self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray, *, exposure_s: float) -> None:
         """Filter a group's poses over frames and write them; poses that are doubted are left out."""
 
         def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -175,7 +175,7 @@ class Tables:
         for name, array in values.items():
             table[name][:, group.column] = array.reshape(self._n_frame, len(group.column), *array.shape[1:])
 
-    def put_delays(self, group: MirrorGroup, found: Found, time_s: FloatArray) -> Found:
+    def put_delays(self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray) -> PoseEstimates:
         """Learn the delays of a group over frames, write them, and return its poses refined by them."""
         scenario = self._stages.scenario
         speed = scenario.radio.propagation_speed_mps
@@ -232,7 +232,7 @@ class Tables:
         )
 
 
-def _with_clocks(found: Found) -> FloatArray:
+def _with_clocks(found: PoseEstimates) -> FloatArray:
     """Covariance of pose and clocks of every mirror."""
     if found.full_cov is not None:
         return np.array(found.full_cov)

@@ -22,13 +22,13 @@ from rfpose.feedback.mount import Actuator, Mount, command, posture
 from rfpose.files import claim
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.scenario import Scenario, load_scenario
-from rfpose.sun import Site, sun_position, unix_seconds
+from rfpose.sun import Location, sun_position, unix_seconds
 
 __all__ = ["ERRORS", "KINDS", "TRUE", "write_sample"]
 
 KINDS = ("paint", "camera", "drone", "motors")
 
-SITE = Site(latitude_rad=float(np.radians(37.1)), longitude_rad=float(np.radians(-2.36)), altitude_m=500.0)
+SITE = Location(latitude_rad=float(np.radians(37.1)), longitude_rad=float(np.radians(-2.36)), altitude_m=500.0)
 HELIOSTAT = "A1"
 BOARD_ENU_M, BOARD_NORMAL = np.array([0.0, 0.0, 12.0]), np.array([0.0, 1.0, 0.0])
 PLANNED = Mount(pivot_enu_m=np.array([6.0, 36.0, 1.5]), actuators=(Actuator(counts_per_unit=5000.0),) * 2)
@@ -122,11 +122,11 @@ def _camera(folder: Path, seed: int) -> None:
 
 
 def _drone(folder: Path, seed: int) -> None:
-    from rfpose.feedback.drone import Drone, fly
+    from rfpose.feedback.drone import RtkDrone, fly
 
     _planned(folder)
     rng = np.random.default_rng(seed)
-    (made,) = fly([TRUE], target_enu_m=BOARD_ENU_M, n_point=60, rng=rng, drone=Drone(), layout="dome")
+    (made,) = fly([TRUE], target_enu_m=BOARD_ENU_M, n_point=60, rng=rng, drone=RtkDrone(), layout="dome")
     names = ",".join(f"{what}_{axis}_m" for what in ("drone", "target") for axis in ("east", "north", "up"))
     rows = [[HELIOSTAT, *c, *r[:3], *r[4:7]] for c, r in zip(made.count.tolist(), made.row.tolist(), strict=True)]
     _table(folder / "flight.csv", f"heliostat,axis_1,axis_2,{names}", rows)

@@ -17,7 +17,7 @@ from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.multilat.site import Common, Voltages
 from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.mirrors import MirrorGroup
-from rfpose.propagation import Foresight, Rays, Soil, Stand, Surroundings, foresee
+from rfpose.propagation import Foresight, Rays, ReceiverStand, Soil, Surroundings, foresee
 from rfpose.propagation.site import place_things
 from rfpose.scenario import Scenario
 
@@ -242,7 +242,7 @@ class SiteField:
         pivots = np.full((len(standing), 3), np.nan)
         pivots[group.column] = pivot
         found = place_things(scenario, standing, pivot_enu_m=pivots)
-        stand = Stand(
+        stand = ReceiverStand(
             pivot_enu_m=pivot,
             rot_enu_from_mirror=rot,
             receiver_mirror_m=group.places_m,
@@ -261,11 +261,11 @@ class SiteField:
         soil_slope = np.zeros(rays.n_ray, np.complex128) if certain else self._soil_slope(stand, things, rays)
         return Voltages(rays=rays, voltage=voltage, slope=slope, soil_slope=soil_slope, vague=vague, reference_rot=rot)
 
-    def _rays(self, stand: Stand, things: Surroundings) -> Rays:
+    def _rays(self, stand: ReceiverStand, things: Surroundings) -> Rays:
         scenario = self._scenario
         return foresee(scenario.transmitter_enu_m, scenario.carrier_rf_hz, stand, things, self._options)
 
-    def _soil_slope(self, stand: Stand, things: Surroundings, rays: Rays) -> ComplexArray:
+    def _soil_slope(self, stand: ReceiverStand, things: Surroundings, rays: Rays) -> ComplexArray:
         """Relative change of rays' fields by a relative change of the ground's complex permittivity."""
         out = np.zeros(rays.n_ray, np.complex128)
         if things.soil is None or not self._options.ground:

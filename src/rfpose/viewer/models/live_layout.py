@@ -14,7 +14,7 @@ from rfpose.checks import FloatArray
 from rfpose.errors import GeometryError, RfposeError, ScenarioError
 from rfpose.geometry import azimuth_elevation_from_enu, enu_from_azimuth_elevation
 from rfpose.layout import maps
-from rfpose.layout.maps import ESTIMATORS, Mirrors, summarise
+from rfpose.layout.maps import ESTIMATORS, PosedMirrors, summarise
 from rfpose.layout.optimise import CRITERIA, Constraints, Costs, Criterion, Zone, optimise
 from rfpose.measurement import SCENARIO
 from rfpose.multilat import check_unambiguous
@@ -149,7 +149,7 @@ def sun_of(scenario: Scenario, moment: datetime) -> SunPlace:
     ScenarioError
         The scenario does not say where the site is.
     """
-    from rfpose.sun import Site, sun_position, unix_seconds
+    from rfpose.sun import Location, sun_position, unix_seconds
 
     place = scenario.site
     if place.latitude_deg is None or place.longitude_deg is None:
@@ -157,7 +157,7 @@ def sun_of(scenario: Scenario, moment: datetime) -> SunPlace:
             f"scenario `{scenario.name}` has no place on Earth: add `latitude_deg` and `longitude_deg` to [site], or "
             "set the sun's azimuth and elevation by hand"
         )
-    site = Site(
+    site = Location(
         latitude_rad=np.radians(place.latitude_deg),
         longitude_rad=np.radians(place.longitude_deg),
         altitude_m=place.height_m,
@@ -203,7 +203,7 @@ class LiveLayout:
         return np.empty((0, 3)) if self._field is None else self._field.pivot_enu_m
 
     @property
-    def field(self) -> Mirrors | None:
+    def field(self) -> PosedMirrors | None:
         """The mirrors in their posture; None where there are none."""
         return self._field
 
@@ -233,7 +233,7 @@ class LiveLayout:
             made_by=f"{self._made_by(study)}; posture: {_POSTURE_WORDS[self._posture]}",
         )
 
-    def _made_by(self, study: maps.Study) -> str:
+    def _made_by(self, study: maps.NormalsStudy) -> str:
         said = list(dict.fromkeys(maps.in_words(e, self._speed_mps) for e in study.rows))
         return said[0] if len(said) == 1 else f"heliostats differ ({' | '.join(said)})"
 
@@ -257,7 +257,7 @@ def _bare(scenario: Scenario, tones: Sequence[int]) -> Scenario:
     return scenario.changed(heliostat=(), tone=kept, simulation={"blocked": None, "dropped": None})
 
 
-def _mirrors(scenario: Scenario, choice: LayoutChoice) -> Mirrors:
+def _mirrors(scenario: Scenario, choice: LayoutChoice) -> PosedMirrors:
     if choice.posture == "scenario":
         return maps.mirrors_of(scenario)
     if choice.posture == "level":

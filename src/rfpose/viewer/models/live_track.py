@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, read_only
 from rfpose.feedback.fieldcontrol.modes import Mode
-from rfpose.feedback.tracking.live import LiveField, Moment, live_scenario
+from rfpose.feedback.tracking.live import FieldMoment, LiveField, live_scenario
 from rfpose.pipeline.pictures.track_view import ON_RECEIVER, Instant, instant_at
 from rfpose.scenario import Scenario
 
@@ -104,7 +104,7 @@ class LiveTrack:
     def advance(self, n_step: int, on_progress: Callable[[int, int], None] | None = None) -> LivePicture | None:
         """Go on by up to ``n_step`` steps, fewer at the end of the day; None if it is over already."""
         seconds, rms = [], []
-        moment: Moment | None = None
+        moment: FieldMoment | None = None
         for i in range(n_step):
             with self._lock:
                 if self._field.over:
@@ -141,12 +141,12 @@ class LiveTrack:
         )
 
 
-def _error_rad(moment: Moment) -> FloatArray:
+def _error_rad(moment: FieldMoment) -> FloatArray:
     """Return the errors of mirrors on the receiver (mirror,); one in stow or on its way there has none."""
     return np.asarray(np.where(np.isin(_shining(moment), ON_RECEIVER), moment.error_rad, np.nan))
 
 
-def _shining(moment: Moment) -> npt.NDArray[np.int64]:
+def _shining(moment: FieldMoment) -> npt.NDArray[np.int64]:
     """Return modes (mirror,) as their light knows them: a mirror whose motors stand shines on, whatever it is told."""
     return np.where(moment.stopped, int(Mode.TRACK), moment.mode).astype(np.int64)
 

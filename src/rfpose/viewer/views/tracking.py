@@ -23,7 +23,7 @@ from PySide6.QtWidgets import (
 )
 
 from rfpose.drawing import PINK
-from rfpose.pipeline.pictures.track_view import Happening, Instant, TrackPicture, clock, groups
+from rfpose.pipeline.pictures.track_view import FieldHappening, Instant, TrackPicture, clock, groups
 from rfpose.pipeline.pictures.tracking import method_colours
 from rfpose.viewer.state.playback import SPEEDS
 from rfpose.viewer.state.session import Selection, Session
@@ -253,7 +253,7 @@ class TrackingView(View):
         self.story.warn([i for i, each in enumerate(happened) if each.trouble], self.theme.warning)
         self.tables.setTabVisible(1, bool(happened))
 
-    def _mark(self, picture: TrackPicture, happened: tuple[Happening, ...]) -> list[str]:
+    def _mark(self, picture: TrackPicture, happened: tuple[FieldHappening, ...]) -> list[str]:
         """Draw a line for each happening, those close together as one, and return their numbers; empty: no line."""
         places = np.array([picture.place_h(each) if each.mark else np.nan for each in happened])
         order = [int(i) for i in np.argsort(places, kind="stable") if np.isfinite(places[i])]
