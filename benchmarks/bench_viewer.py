@@ -24,7 +24,7 @@ from PySide6.QtCore import QEvent, QObject
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.recording import RecordingWriter
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from rfpose.viewer.export import open_window, settle
 
 _GIVE_UP_S = 60.0
@@ -132,17 +132,11 @@ class Paints(QObject):
 
 def drag(n_heliostat: int, n_step: int) -> None:
     """Drag a transmitter around a circle, as fast as pictures come."""
-    site = load_scenario(shipped_scenario("table2_100m.toml"))
-    data = site.model_dump(exclude_none=True)
-    like = data["heliostat"][0]
     places = radial_staggered(n_heliostat, first_radius_m=12.0, diagonal_m=3.0, height_m=2.0)
-    data["heliostat"] = [
-        like | {"id": f"H{k}", "pivot_enu_m": tuple(p), "receiver_ids": tuple(f"H{k}_r{i}" for i in range(3))}
-        for k, p in enumerate(places.tolist())
-    ]
+    site = load_scenario(shipped_scenario("table2_100m.toml")).with_field(places)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "field.toml"
-        path.write_text(Scenario.model_validate(data).to_toml())
+        site.save(path)
         app, window = open_window(path)
     view, edit = window.views["layout"], window.session.layout
     paints = Paints()

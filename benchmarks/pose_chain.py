@@ -43,34 +43,35 @@ FORMS = {
 
 def site(rows: tuple[Any, ...], n_frame: int) -> Scenario:
     """Return the shipped field with one mirror a row."""
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    mirror = {k: v for k, v in data["heliostat"][0].items() if k in ("receiver_mirror_m", "oscillator")}
-    data["heliostat"] = [
-        {
-            "id": f"M{k}",
-            "pivot_enu_m": [100.0 * x for x in place],
-            "normal_enu": list(facing),
-            "receiver_ids": [f"M{k}_r{r}" for r in range(3)],
-            "carrier_phase": False,
-            **mirror,
-        }
+    shipped = load_scenario(SHIPPED)
+    heliostats = [
+        shipped.heliostat[0].changed(
+            id=f"M{k}",
+            pivot_enu_m=[100.0 * x for x in place],
+            normal_enu=list(facing),
+            receiver_ids=[f"M{k}_r{r}" for r in range(3)],
+            carrier_phase=False,
+        )
         for k, (place, facing) in enumerate(rows)
     ]
-    data["calibration_receiver"] = [
+    calibration_receivers = [
         {"id": f"cal{k}", "position_enu_m": [x, y, 2.5]}
         for k, (x, y) in enumerate([(15, -20), (-40, 30), (50, 50), (-30, -60)])
     ]
-    wavelength_m = 299_792_458.0 / data["tone"][0]["frequency_hz"]
+    wavelength_m = 299_792_458.0 / shipped.tone_hz[0]
     phase_sigma = 2.0 * np.pi * RANGE_SIGMA_M / wavelength_m
-    data["radio"] |= {"frame_samples": FRAME_SAMPLES, "clock_search_ppm": 2.0}
-    data["simulation"] |= {
-        "frame_count": n_frame,
-        "frame_interval_s": 0.1,
-        "tone_snr_db": -10.0 * np.log10(FRAME_SAMPLES * phase_sigma**2),
-        "path_loss": "none",
-        "clock_offset_ppm": 0.0,
-    }
-    return Scenario.model_validate(data)
+    return shipped.changed(
+        heliostat=heliostats,
+        calibration_receiver=calibration_receivers,
+        radio={"frame_samples": FRAME_SAMPLES, "clock_search_ppm": 2.0},
+        simulation={
+            "frame_count": n_frame,
+            "frame_interval_s": 0.1,
+            "tone_snr_db": -10.0 * np.log10(FRAME_SAMPLES * phase_sigma**2),
+            "path_loss": "none",
+            "clock_offset_ppm": 0.0,
+        },
+    )
 
 
 def measure(rows: tuple[Any, ...], n_frame: int, *, seed: int = 7) -> dict[str, Evaluation]:
@@ -80,7 +81,7 @@ def measure(rows: tuple[Any, ...], n_frame: int, *, seed: int = 7) -> dict[str, 
     out = {}
     for name, form in FORMS.items():
         known = {k: v for k, v in form.items() if k != "pose"}
-        told = scenario.changed(heliostat=[h.model_dump(exclude_none=True) | known for h in scenario.heliostat])
+        told = scenario.changed(heliostat=known)
         choice = choose(told, pose=str(form["pose"]))
         how = {"sample_rate": result.sample_rate, "settings": result.settings, "truth": result.truth}
         out[name] = evaluate(solve(result.tones, told, choice, **how))

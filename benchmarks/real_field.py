@@ -451,7 +451,7 @@ def _told_site(spec: Spec, truth: Scenario) -> Scenario:
     size = {} if has_plate else {"width_m": None, "height_m": None}
     told = truth.changed(
         heliostat=[
-            {**h.model_dump(exclude_none=True), **size, "pivot_enu_m": tuple(p)}
+            h.changed(**size, pivot_enu_m=tuple(p))
             for h, p in zip(truth.heliostat, (truth.pivot_enu_m + off).tolist(), strict=True)
         ]
     )

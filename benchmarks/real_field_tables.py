@@ -44,11 +44,10 @@ def site_of(transmitters: str, mhz: float, sun: int) -> Scenario:
     site = traced.site_of(rf_hz, "beside", transmitter_enu_m=places)
     names = [(place, k) for place in traced.PLACES_M for k in range(len(traced.PLACES_M[place]))]
     heliostats = [
-        {
-            **h.model_dump(exclude_none=True),
-            "receiver_mirror_m": [traced.PLACES_M[place][k] for place, k in names],
-            "receiver_ids": [f"{place}.{h.id}_r{k}" for place, k in names],
-        }
+        h.changed(
+            receiver_mirror_m=[traced.PLACES_M[place][k] for place, k in names],
+            receiver_ids=[f"{place}.{h.id}_r{k}" for place, k in names],
+        )
         for h in site.heliostat
     ]
     soil, concrete = traced.soil(rf_hz), traced.concrete(rf_hz)
@@ -56,7 +55,7 @@ def site_of(transmitters: str, mhz: float, sun: int) -> Scenario:
     azimuth, elevation = traced.sun_deg(sun)
     return site.changed(
         heliostat=heliostats,
-        site={"structures": {"box": [{**b.model_dump(), **box} for b in site.site.structures.box]}},
+        site={"structures": {"box": [b.changed(**box) for b in site.site.structures.box]}},
         reflection={"model": "fresnel", "permittivity": soil[0], "conductivity_s_per_m": soil[1]},
         simulation={"sun_azimuth_deg": azimuth, "sun_elevation_deg": elevation, "frame_count": 1},
     )

@@ -47,20 +47,17 @@ def damping(natural_hz: float, wind_mps: float) -> float:
 def field(hours: Sequence[float], wind_mps: float, mode_hz: float, interval_s: float, law: PiLaw | None,
           grown: float = 1.0) -> Scenario:  # fmt: skip
     """Return the shipped scenario with nothing wrong but the wind."""
-    data = load_scenario(SCENARIO).model_dump(exclude_none=True)
-    table: dict[str, Any] = data["tracking"] | {
-        "first_hour": hours[0], "last_hour": hours[1], "control_interval_s": interval_s, "mount_errors": NO_ERRORS,
-    }  # fmt: skip
-    table.pop("field_control", None)
-    table["drive"] = {**table["drive"], "steps_per_turn": 4e6, "backlash_mrad": (0.0, 0.0)}
-    table["wind"] = {"mean_speed_mps": wind_mps, "deflection_mrad_per_mps2": [grown * each for each in BEND_MRAD]}
-    table["structure"] = {"natural_hz": mode_hz, "damping": damping(mode_hz, wind_mps) if mode_hz else 0.02}
-    table["radio"] = {**table["radio"], "plate_sigma_mrad": 0.0, "plate_calibration": "none", "lost_frames": 0.0,
-                      "ground": "none"}  # fmt: skip
+    radio: dict[str, Any] = {"plate_sigma_mrad": 0.0, "plate_calibration": "none", "lost_frames": 0.0, "ground": "none"}
     if law is not None:  # designed ones stand at the least margin, give or take a rounding
-        table["radio"]["force_gains"] = True
-        table["radio"] |= {"gain_per_s": law.gain_per_s, "integral_gain_per_s2": law.integral_gain_per_s2}
-    return Scenario.model_validate({**data, "tracking": table})
+        radio["force_gains"] = True
+        radio |= {"gain_per_s": law.gain_per_s, "integral_gain_per_s2": law.integral_gain_per_s2}
+    return load_scenario(SCENARIO).changed(tracking={
+        "first_hour": hours[0], "last_hour": hours[1], "control_interval_s": interval_s, "mount_errors": NO_ERRORS,
+        "field_control": None, "drive": {"steps_per_turn": 4e6, "backlash_mrad": (0.0, 0.0)},
+        "wind": {"mean_speed_mps": wind_mps, "deflection_mrad_per_mps2": [grown * each for each in BEND_MRAD]},
+        "structure": {"natural_hz": mode_hz, "damping": damping(mode_hz, wind_mps) if mode_hz else 0.02},
+        "radio": radio,
+    })  # fmt: skip
 
 
 def rms_mrad(scenario: Scenario, method: str, mirrors: int) -> float:

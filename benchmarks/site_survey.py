@@ -42,7 +42,7 @@ def sites():
     base = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     told = {"pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
     known = base.changed(
-        heliostat=[{**h.model_dump(exclude_none=True), **told} for h in base.heliostat[:N_HELIOSTAT]],
+        heliostat=[h.changed(**told) for h in base.heliostat[:N_HELIOSTAT]],
         site={"aim_enu_m": [0.0, 0.0, 50.0]},
         radio={"frame_samples": 20_000, "centre_frequency_hz": 433e6},
         posture={"sigma_rad": 0.005},
@@ -52,7 +52,7 @@ def sites():
     heliostats = []
     for h in known.heliostat:
         places = np.array(h.receiver_mirror_m) + 1e-3 * rng.standard_normal((len(h.receiver_mirror_m), 3))
-        heliostats.append({**h.model_dump(exclude_none=True), "receiver_mirror_m": places.tolist()})
+        heliostats.append(h.changed(receiver_mirror_m=places.tolist()))
     return known, known.changed(heliostat=heliostats), rng
 
 

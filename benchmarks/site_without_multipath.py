@@ -21,7 +21,7 @@ def site(snr_db: float, frames: int) -> rf.Scenario:
     plain = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     known = {"pivot_sigma_m": 0.005, "oscillator": "shared", "receiver_delay_sigma_s": 0.0}
     return plain.changed(
-        heliostat=[{**h.model_dump(exclude_none=True), **known} for h in plain.heliostat],
+        heliostat=known,
         radio={"frame_samples": 20_000, "centre_frequency_hz": 433e6},
         simulation={"tone_snr_db": snr_db, "frame_count": frames, "sample_format": "complex64"},
     )

@@ -24,26 +24,26 @@ PHASES_RAD = (0.0, 1.5, 3.0, 4.5)
 
 def site(coefficient: complex) -> Scenario:
     """Return four heliostats of the shipped field, carriers far enough apart for 7.5 MHz tones."""
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = [{**h, "pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 0.0} for h in data["heliostat"][:4]]
-    data["radio"] |= {
-        "sample_rate_hz": 64e6,
-        "frame_samples": 4000,
-        "clock_search_ppm": 2.0,
-        "centre_frequency_hz": 433e6,
-    }
-    data["tone"] = [{"frequency_hz": f, "modulation_index": 0.4} for f in (0.75e6, 7.5e6)]
-    for i, transmitter in enumerate(data["transmitter"]):
-        transmitter["carrier_hz"] = -16.2e6 + 3.6e6 * i
-    data["simulation"] |= {
-        "frame_count": 4,
-        "frame_interval_s": 1.0,
-        "tone_snr_db": 46.0,
-        "sun_azimuth_deg": 170.0,
-        "path_loss": "free_space",
-        "ground": {"coefficient": (coefficient.real, coefficient.imag)},
-    }
-    return Scenario.model_validate(data)
+    shipped = load_scenario(SHIPPED)
+    return shipped.changed(
+        heliostat=[h.changed(pivot_sigma_m=0.005, receiver_delay_sigma_s=0.0) for h in shipped.heliostat[:4]],
+        radio={
+            "sample_rate_hz": 64e6,
+            "frame_samples": 4000,
+            "clock_search_ppm": 2.0,
+            "centre_frequency_hz": 433e6,
+        },
+        tone=[{"frequency_hz": f, "modulation_index": 0.4} for f in (0.75e6, 7.5e6)],
+        transmitter=[t.changed(carrier_hz=-16.2e6 + 3.6e6 * i) for i, t in enumerate(shipped.transmitter)],
+        simulation={
+            "frame_count": 4,
+            "frame_interval_s": 1.0,
+            "tone_snr_db": 46.0,
+            "sun_azimuth_deg": 170.0,
+            "path_loss": "free_space",
+            "ground": {"coefficient": (coefficient.real, coefficient.imag)},
+        },
+    )
 
 
 def main() -> None:

@@ -73,7 +73,7 @@ def site_of(rf_hz: float, place: str, *, transmitter_enu_m: Array | None = None)
     site = parse_scenario(SITE.read_text(), source=str(SITE)).changed(radio={"centre_frequency_hz": rf_hz})
     names = [{"receiver_ids": [f"{h.id}_r{k}" for k in range(len(PLACES_M[place]))]} for h in site.heliostat]
     like = {"receiver_mirror_m": PLACES_M[place]}
-    heliostats = [{**h.model_dump(exclude_none=True), **like, **n} for h, n in zip(site.heliostat, names, strict=True)]
+    heliostats = [h.changed(**like, **n) for h, n in zip(site.heliostat, names, strict=True)]
     site = site.changed(heliostat=heliostats)
     if transmitter_enu_m is None:
         return site

@@ -69,13 +69,10 @@ PARTS: tuple[tuple[str, Sequence[str], Change], ...] = (
 
 def changed(hours: Sequence[float], *changes: Change) -> Scenario:
     """Return the shipped scenario without field control, keys of [tracking] replaced by one change after the other."""
-    data = load_scenario(SCENARIO).model_dump(exclude_none=True)
-    table = data["tracking"] | {"first_hour": hours[0], "last_hour": hours[1]}
-    table.pop("field_control", None)
-    for change in changes:
-        for key, value in change.items():
-            table[key] = {**table[key], **value} if isinstance(value, dict) else value
-    return Scenario.model_validate({**data, "tracking": table})
+    site = load_scenario(SCENARIO)
+    for change in ({"first_hour": hours[0], "last_hour": hours[1], "field_control": None}, *changes):
+        site = site.changed(tracking=change)
+    return site
 
 
 def simulated(scenario: Scenario, methods: Sequence[str], mirrors: int, seed: int) -> dict[str, Score]:

@@ -33,7 +33,7 @@ def drifting(n_frame: int, drift_rad: float, *, stale: bool, mirror: dict[str, A
         for f in range(N_CALIBRATED, n_frame)
     ]
     return base.changed(
-        heliostat=[h.model_dump(exclude_none=True) | {"pivot_sigma_m": 0.005} | mirror for h in base.heliostat],
+        heliostat=[h.changed(pivot_sigma_m=0.005, **mirror) for h in base.heliostat],
         simulation={
             "frame_interval_s": 3600.0 / n_frame,
             "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,

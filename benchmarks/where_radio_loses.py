@@ -48,13 +48,7 @@ CASES: tuple[tuple[str, Change, Change], ...] = (
 
 def changed(base: Scenario, change: Change, mirror: Change, hours: tuple[float, float]) -> Scenario:
     """Return the scenario with some keys of [tracking] and of all mirrors replaced."""
-    data = base.model_dump(exclude_none=True)
-    table = data["tracking"] | {"first_hour": hours[0], "last_hour": hours[1]}
-    for key, value in change.items():
-        table[key] = {**table[key], **value}
-    data["tracking"] = table
-    data["heliostat"] = [{**h, **mirror} for h in data["heliostat"]]
-    return Scenario.model_validate(data)
+    return base.changed(tracking={"first_hour": hours[0], "last_hour": hours[1], **change}, heliostat=mirror)
 
 
 def main() -> None:

@@ -25,7 +25,7 @@ from rfpose.feedback.paint import read_heliostat
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.formats.mount_file import read_models
 from rfpose.pipeline.formats.result_file import open_result
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from rfpose.sun import Location, sun_position, unix_seconds
 
 PAINT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "paint"
@@ -101,11 +101,9 @@ def _fly(path: Path) -> None:
 
 def _radio(where: Path) -> dict[str, Any]:
     """A result of two frames of one heliostat, and the log of its motors; returns its planned mount."""
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:1]
-    data["radio"]["frame_samples"] = 8000
-    data["simulation"] |= {"frame_count": 2, "sun_azimuth_deg": 170.0}
-    (where / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    site = load_scenario(shipped_scenario("table2_100m.toml"))
+    short = {"radio": {"frame_samples": 8000}, "simulation": {"frame_count": 2, "sun_azimuth_deg": 170.0}}
+    site.changed(heliostat=site.heliostat[:1], **short).save(where / "site.toml")
     _json("simulate", where / "site.toml", "-o", where / "rec.h5", "--seed", 4)
     _json("process", where / "rec.h5", "-o", where / "result.h5")
     result = open_result(where / "result.h5")

@@ -22,7 +22,7 @@ from rfpose.pipeline.formats.result_file import open_result
 from rfpose.recording import open_recording
 from rfpose.recording.base import WrittenFormat
 from rfpose.recording.writer import COMPRESSIONS
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from told import undocumented, unseen
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -144,8 +144,7 @@ def test_existing_output_is_refused(directory: Path, command: tuple[str, ...], o
 
 
 def test_differing_scenario_is_said_on_standard_error(directory: Path, tmp_path: Path) -> None:
-    data = load_scenario(directory / "site.toml").model_dump(exclude_none=True)
-    (tmp_path / "site.toml").write_text(Scenario.model_validate(data | {"name": "another"}).to_toml())
+    load_scenario(directory / "site.toml").changed(name="another").save(tmp_path / "site.toml")
     arguments = ("process", directory / "rec.h5", "-o", tmp_path / "r.h5", "--scenario", tmp_path / "site.toml")
     shown = _run(*arguments, "--json")
     assert json.loads(shown.stdout)["poses"]["solved"] == 3

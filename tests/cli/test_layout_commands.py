@@ -66,7 +66,7 @@ def short_site(tmp_path, **changes):
 def test_the_scenarios_own_estimator_is_that_of_process(tmp_path):
     """Map and evaluation of one scenario, frames standing still: the same bound, by two independent ways."""
     for mirror in ({}, {"pivot_sigma_m": 0.005, "receiver_delay_sigma_s": 2e-12}, {"oscillator": "separate"}):
-        heliostats = [{**h.model_dump(exclude_none=True), **mirror} for h in load_scenario(SITE).heliostat[:3]]
+        heliostats = [h.changed(**mirror) for h in load_scenario(SITE).heliostat[:3]]
         still = {"frame_count": 2, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0, "sample_format": "complex64"}
         tones = [{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}]
         site = short_site(tmp_path, heliostat=heliostats, simulation=still, tone=tones)
@@ -96,8 +96,8 @@ def test_a_site_about_frequency_zero_has_no_carriers_to_compare(tmp_path):
 
 
 def test_mirrors_that_differ_have_each_its_own_estimator(tmp_path):
-    heliostats = [h.model_dump(exclude_none=True) for h in load_scenario(SITE).heliostat[:2]]
-    heliostats[1]["oscillator"] = "separate"
+    one, other = load_scenario(SITE).heliostat[:2]
+    heliostats = [one, other.changed(oscillator="separate")]
     both = layout_map(short_site(tmp_path, heliostat=heliostats), sensitivity=True)
     each = [layout_map(short_site(tmp_path, heliostat=[h])).rms_mrad["scenario"][0] for h in heliostats]
     np.testing.assert_allclose(both.rms_mrad["scenario"], each)
@@ -333,9 +333,7 @@ def test_constraints_that_cannot_be_met_are_refused():
 
 def surveyed(tmp_path, **changes):
     """Save Table 2's site with surveyed pivots at 433 MHz."""
-    heliostats = [
-        {**h.model_dump(exclude_none=True), "pivot_sigma_m": 0.005} for h in load_scenario(SITE).heliostat[:3]
-    ]
+    heliostats = [h.changed(pivot_sigma_m=0.005) for h in load_scenario(SITE).heliostat[:3]]
     return short_site(tmp_path, heliostat=heliostats, radio={"centre_frequency_hz": 433e6}, **changes)
 
 
@@ -371,9 +369,8 @@ def test_the_reason_is_of_the_first_posture_that_is_not_solved():
 def test_map_of_pose_site_refuses_what_pose_site_does(tmp_path):
     with pytest.raises(ScenarioError, match=r"site\.toml: pose `site` .* not surveyed; give `pivot_sigma_m`"):
         layout_map(short_site(tmp_path), estimators=["site"])
-    heliostats = [{**h.model_dump(exclude_none=True), "oscillator": "separate"} for h in load_scenario(SITE).heliostat]
     with pytest.raises(ScenarioError, match=r"site\.toml: pose `site` compares carriers .* `H01` does not"):
-        layout_map(short_site(tmp_path, heliostat=heliostats), estimators=["site"])
+        layout_map(short_site(tmp_path, heliostat={"oscillator": "separate"}), estimators=["site"])
     site = surveyed(tmp_path)
     sight = Sight(plates=Plates(width_m=3.2, height_m=2.6))
     with pytest.raises(ScenarioError, match=r"estimator `site` foresees for itself"):

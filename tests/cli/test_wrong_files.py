@@ -14,7 +14,7 @@ from rfpose.pipeline.formats.mount_file import MODEL_FORMAT
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
-from rfpose.scenario import check_scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 DATA = Path(__file__).resolve().parents[2] / "data"
 
@@ -27,14 +27,17 @@ def run(*arguments: object) -> tuple[int, str, str]:
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("kinds")
-    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
-    data["heliostat"], data["radio"]["frame_samples"] = data["heliostat"][:2], 8000
-    data["tone"] = [{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}]
-    data["tracking"] = {"first_hour": 11.0, "last_hour": 11.2, "settle_s": 60.0, "date": "2026-03-20"}
-    data["site"] |= {"latitude_deg": -33.9, "longitude_deg": 18.9}
+    site = load_scenario(DATA / "table2_100m.toml")
+    site = site.changed(
+        heliostat=site.heliostat[:2],
+        radio={"frame_samples": 8000},
+        tone=[{"frequency_hz": 750e3, "modulation_index": 0.4}, {"frequency_hz": 1e6, "modulation_index": 0.3}],
+        tracking={"first_hour": 11.0, "last_hour": 11.2, "settle_s": 60.0, "date": "2026-03-20"},
+        site={"latitude_deg": -33.9, "longitude_deg": 18.9},
+    )
     names = {"recording": "rec.h5", "result": "result.h5", "track": "run.h5", "scenario": "site.toml"}
     paths = {kind: folder / name for kind, name in names.items()}
-    paths["scenario"].write_text(check_scenario(data).to_toml())
+    site.save(paths["scenario"])
     simulate(paths["scenario"], seed=1).save(paths["recording"])
     process(paths["recording"], paths["result"], estimator="correlator")
     track(paths["scenario"], paths["track"], methods=("open-loop", "encoder"))
@@ -148,14 +151,15 @@ def test_extras_are_installed_from_a_checkout_too() -> None:
 
 
 def test_reflections_without_radio_frequencies_are_refused_in_the_users_words(tmp_path: Path) -> None:
-    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
-    data["heliostat"], data["radio"]["frame_samples"] = data["heliostat"][:2], 8000
-    data["radio"]["centre_frequency_hz"] = 0.0
-    data["simulation"]["ground"] = {"coefficient": [-0.3, 0.1]}
-    data["reflection"] = {"model": "estimate"}
-    data["site"] |= {"latitude_deg": -33.9, "longitude_deg": 18.9}
+    table2 = load_scenario(DATA / "table2_100m.toml")
     site = tmp_path / "site.toml"
-    site.write_text(check_scenario(data).to_toml())
+    table2.changed(
+        heliostat=table2.heliostat[:2],
+        radio={"frame_samples": 8000, "centre_frequency_hz": 0.0},
+        simulation={"ground": {"coefficient": [-0.3, 0.1]}},
+        reflection={"model": "estimate"},
+        site={"latitude_deg": -33.9, "longitude_deg": 18.9},
+    ).save(site)
     simulate(site, seed=1).save(tmp_path / "rec.h5")
     for command in (
         ("layout", "budget", site),

@@ -23,10 +23,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("workshop")
     base = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     site = base.changed(
-        heliostat=[
-            {**h.model_dump(exclude_none=True), "pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
-            for h in base.heliostat[:2]
-        ],
+        heliostat=[h.changed(pivot_sigma_m=0.003, receiver_delay_sigma_s=0.0) for h in base.heliostat[:2]],
         site={"latitude_deg": 37.1, "longitude_deg": -2.36},
         radio={"frame_samples": 8000},
         multipath={"foresee": [], "visibility": False},

@@ -32,7 +32,7 @@ from rfpose.pipeline.process import process
 from rfpose.pipeline.samples.paint import write_json, write_paint
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.track import track
-from rfpose.scenario import Scenario, check_scenario, load_scenario, read_positions
+from rfpose.scenario import Scenario, load_scenario, read_positions
 from rfpose.sun import Location
 from rfpose.tables import write_csv
 
@@ -43,13 +43,14 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 
 
 def small_site() -> Scenario:
-    data = load_scenario(DATA / "table2_100m.toml").model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:2]
-    data["radio"]["frame_samples"] = 4000
-    data["simulation"] |= {"frame_count": 3, "ground": {"coefficient": [-0.1, 0.05]}}
-    data["reflection"] = {"model": "known", "coefficient": [-0.1, 0.05]}
-    data["motion"] = {"filtered": True}
-    return check_scenario(data)
+    site = load_scenario(DATA / "table2_100m.toml")
+    return site.changed(
+        heliostat=site.heliostat[:2],
+        radio={"frame_samples": 4000},
+        simulation={"frame_count": 3, "ground": {"coefficient": [-0.1, 0.05]}},
+        reflection={"model": "known", "coefficient": [-0.1, 0.05]},
+        motion={"filtered": True},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +67,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tracked")
-    day = load_scenario(DATA / "tracking_100m.toml").model_dump(exclude_none=True)
-    day["heliostat"] = day["heliostat"][:3]
-    day["tracking"] |= {"first_hour": 11.0, "last_hour": 11.3, "settle_s": 60.0}
-    day["tracking"]["event"] = [{"hour": 11.2, "what": "emergency"}]
-    (folder / "day.toml").write_text(check_scenario(day).to_toml())
+    day = load_scenario(DATA / "tracking_100m.toml")
+    hours = {"first_hour": 11.0, "last_hour": 11.3, "settle_s": 60.0, "event": [{"hour": 11.2, "what": "emergency"}]}
+    day.changed(heliostat=day.heliostat[:3], tracking=hours).save(folder / "day.toml")
     track(folder / "day.toml", folder / "run.h5", methods=("radio", "open-loop"))
     return folder / "run.h5"
 

@@ -18,7 +18,7 @@ from rfpose.errors import RecordingError
 from rfpose.files import claim, write_atomically
 from rfpose.interruption import held_back
 from rfpose.recording.output import Hdf5Output
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -61,11 +61,9 @@ def _names(directory: Path) -> set[str]:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with a small site, its recording, a SigMF copy and a result."""
     where = tmp_path_factory.mktemp("made")
-    data = load_scenario(ROOT / "data" / "table2_100m.toml").model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:1]
-    data["radio"]["frame_samples"] = 8000
-    data["simulation"] |= {"frame_count": 1, "sun_azimuth_deg": 170.0}
-    (where / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    site = load_scenario(ROOT / "data" / "table2_100m.toml")
+    short = {"radio": {"frame_samples": 8000}, "simulation": {"frame_count": 1, "sun_azimuth_deg": 170.0}}
+    site.changed(heliostat=site.heliostat[:1], **short).save(where / "site.toml")
     for words in (
         ["simulate", where / "site.toml", "-o", where / "rec.h5"],
         ["convert", where / "rec.h5", "-o", where / "sig", "--to", "sigmf"],

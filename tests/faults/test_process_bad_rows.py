@@ -24,13 +24,13 @@ SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"
 N_SAMPLE = 8000
 
 
-def _scenario(change: Callable[[dict[str, Any]], None] = lambda _data: None, **simulation: object) -> Scenario:
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:2]
-    data["radio"]["frame_samples"] = N_SAMPLE
-    data["simulation"] |= {"frame_count": 3, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0, **simulation}
-    change(data)
-    return Scenario.model_validate(data)
+def _scenario(mirrors: tuple[int, ...] = (0, 1), **simulation: object) -> Scenario:
+    site = load_scenario(SHIPPED)
+    return site.changed(
+        heliostat=[site.heliostat[k] for k in mirrors],
+        radio={"frame_samples": N_SAMPLE},
+        simulation={"frame_count": 3, "frame_interval_s": 1.0, "sun_azimuth_deg": 170.0, **simulation},
+    )
 
 
 def _record(
@@ -169,11 +169,8 @@ def test_calibration_receiver_that_is_dead_costs_everything_but_the_tones(tmp_pa
 def test_receiver_that_is_not_in_the_recording(
     tmp_path: Path, clean: dict[str, Result], caplog: pytest.LogCaptureFixture
 ) -> None:
-    def add_heliostat(data: dict[str, Any]) -> None:
-        data["heliostat"] += (load_scenario(SHIPPED).heliostat[4].model_dump(exclude_none=True),)
-
     site = tmp_path / "site.toml"
-    site.write_text(_scenario(add_heliostat).to_toml())
+    site.write_text(_scenario((0, 1, 4)).to_toml())
     recording = _record(tmp_path / "rec.h5", _scenario())
     with caplog.at_level(logging.WARNING):
         result = process(recording, tmp_path / "result.h5", scenario=site)

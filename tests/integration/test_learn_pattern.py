@@ -97,11 +97,8 @@ def lessons(folder):
     }  # fmt: skip
     rng = np.random.default_rng(3)
     site = base.changed(
-        heliostat=[{**h.model_dump(exclude_none=True), **told} for h in base.heliostat[:N_MIRROR]],
-        transmitter=[
-            {**t.model_dump(exclude_none=True), "carrier_hz": -495e3 + 110e3 * k}
-            for k, t in enumerate(base.transmitter)
-        ],
+        heliostat=[h.changed(**told) for h in base.heliostat[:N_MIRROR]],
+        transmitter=[t.changed(carrier_hz=-495e3 + 110e3 * k) for k, t in enumerate(base.transmitter)],
         calibration_receiver=[],
         site={"aim_enu_m": [0.0, 0.0, 50.0]},
         radio={"frame_samples": 20_000, "centre_frequency_hz": RF_HZ},
@@ -209,16 +206,17 @@ def test_a_posture_that_is_repeated_counts_once(lessons, folder):
 
 
 def without_outline(site):
-    return [{k: v for k, v in h.items() if k not in ("width_m", "height_m")} for h in site]
+    return site.changed(heliostat={"width_m": None, "height_m": None})
 
 
 def one_larger(site):
-    return [site[0], {**site[1], "width_m": 0.8}, *site[2:]]
+    one, other, *more = site.heliostat
+    return site.changed(heliostat=[one, other.changed(width_m=0.8), *more])
 
 
 def test_carriers_too_far_apart_for_one_pattern_are_refused(lessons):
     site, _, _ = lessons
-    wide = [{**t.model_dump(exclude_none=True), "carrier_hz": 36.0 * t.carrier_hz} for t in site.transmitter]
+    wide = [t.changed(carrier_hz=36.0 * t.carrier_hz) for t in site.transmitter]
     with pytest.raises(ScenarioError, match=r"reach from 415\.18 to 450\.82 MHz, and a learned .* within 2 %"):
         learn_from_frames([], site.changed(transmitter=wide))
 
@@ -229,9 +227,8 @@ def test_carriers_too_far_apart_for_one_pattern_are_refused(lessons):
 )
 def test_mirrors_that_are_no_type_are_refused(lessons, change, said):
     site, recording, _ = lessons
-    other = site.changed(heliostat=change([h.model_dump(exclude_none=True) for h in site.heliostat]))
     with pytest.raises(ScenarioError, match=said):
-        rf.learn_pattern(recording, scenario=other)
+        rf.learn_pattern(recording, scenario=change(site))
 
 
 def test_a_surveys_mounts_tell_where_mirrors_stand(lessons, learned, folder):

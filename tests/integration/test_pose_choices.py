@@ -35,21 +35,21 @@ def site(
     mirror: dict[str, Any], simulation: dict[str, Any], *, tone_hz: tuple[float, ...] = (0.75e6, 7.5e6)
 ) -> Scenario:
     """Four heliostats of the shipped field, carriers far enough apart for 7.5 MHz tones."""
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = [{**h, **mirror} for h in data["heliostat"][:4]]
-    data["radio"] |= {"sample_rate_hz": 64e6, "frame_samples": 4000, "clock_search_ppm": 2.0}
-    data["tone"] = [{"frequency_hz": f, "modulation_index": 0.8 / len(tone_hz)} for f in tone_hz]
-    for i, transmitter in enumerate(data["transmitter"]):
-        transmitter["carrier_hz"] = -16.2e6 + 3.6e6 * i
-    data["simulation"] |= {
-        "frame_count": N_FRAME,
-        "frame_interval_s": 1.0,
-        "tone_snr_db": 60.0,
-        "sun_azimuth_deg": 170.0,
-        "path_loss": "free_space",
-        **simulation,
-    }
-    return Scenario.model_validate(data)
+    shipped = load_scenario(SHIPPED)
+    return shipped.changed(
+        heliostat=[h.changed(**mirror) for h in shipped.heliostat[:4]],
+        radio={"sample_rate_hz": 64e6, "frame_samples": 4000, "clock_search_ppm": 2.0},
+        tone=[{"frequency_hz": f, "modulation_index": 0.8 / len(tone_hz)} for f in tone_hz],
+        transmitter=[t.changed(carrier_hz=-16.2e6 + 3.6e6 * i) for i, t in enumerate(shipped.transmitter)],
+        simulation={
+            "frame_count": N_FRAME,
+            "frame_interval_s": 1.0,
+            "tone_snr_db": 60.0,
+            "sun_azimuth_deg": 170.0,
+            "path_loss": "free_space",
+            **simulation,
+        },
+    )
 
 
 def recorded(scenario: Scenario, directory: Path, name: str) -> Path:
@@ -118,10 +118,8 @@ def test_an_ignored_reflection_is_never_silent(two_ray: Path) -> None:
 
 
 def test_a_given_coefficient_is_used_as_given(two_ray: Path, tmp_path: Path, free_rms: float) -> None:
-    scenario = site(KNOWN, {})
-    known = scenario.model_dump(exclude_none=True) | {"reflection": {"model": "known", "coefficient": COEFFICIENT}}
     path = tmp_path / "known.toml"
-    path.write_text(Scenario.model_validate(known).to_toml())
+    site(KNOWN, {}).changed(reflection={"model": "known", "coefficient": COEFFICIENT}).save(path)
     result = process(two_ray, tmp_path / "r.h5", scenario=path, estimator="correlator")
     assert evaluate(result).normal_error_mrad.rms <= 1.3 * free_rms
     assert result.reflection is not None
@@ -131,11 +129,11 @@ def test_a_given_coefficient_is_used_as_given(two_ray: Path, tmp_path: Path, fre
 @pytest.fixture(scope="module")
 def far_apart(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """Three calibration receivers with reflections of their own, in three frames."""
-    data = site(KNOWN, {"ground": {"coefficient": COEFFICIENT}, "frame_count": 3}).model_dump(exclude_none=True)
-    one = data["calibration_receiver"][0]
+    one = site(KNOWN, {"ground": {"coefficient": COEFFICIENT}, "frame_count": 3})
     places = ([15.0, -20.0, 2.5], [-45.0, 35.0, 8.0], [35.0, 60.0, 8.0])
-    data["calibration_receiver"] = [one | {"id": f"C{k}", "position_enu_m": place} for k, place in enumerate(places)]
-    path = recorded(Scenario.model_validate(data), tmp_path_factory.mktemp("far"), "far")
+    like = one.calibration_receiver[0]
+    three = [like.changed(id=f"C{k}", position_enu_m=place) for k, place in enumerate(places)]
+    path = recorded(one.changed(calibration_receiver=three), tmp_path_factory.mktemp("far"), "far")
     return process(path, path.with_name("r.h5"), estimator="correlator", reflection="estimate")
 
 
@@ -144,8 +142,7 @@ def far_apart(tmp_path_factory: pytest.TempPathFactory) -> Result:
 def test_calibration_receivers_each_have_a_reflection_of_their_own(far_apart: Result, model: str, lost: str) -> None:
     scenario, tones = far_apart.scenario, far_apart.tones
     if model == "known":
-        table = {"reflection": {"model": "known", "coefficient": COEFFICIENT}}
-        scenario = Scenario.model_validate(scenario.model_dump(exclude_none=True) | table)
+        scenario = scenario.changed(reflection={"model": "known", "coefficient": COEFFICIENT})
     if lost == "phases":
         # a frame whose average is of two, a transmitter seen by one, and one that another frame must stand in for
         phase = np.array(tones.phase_rad)
@@ -177,13 +174,12 @@ def _as_measured(scenario: Scenario, directory: Path, name: str) -> Result:
 
 def _among(thickness_m: float, pivot_height_m: float) -> Scenario:
     """Mirrors between transmitters about 2 m high."""
-    data = site({"receiver_delay_sigma_s": 0.0}, {"frame_count": 3}).model_dump(exclude_none=True)
-    heights = 2.0 + thickness_m * np.random.default_rng(5).uniform(-0.5, 0.5, len(data["transmitter"]))
-    for transmitter, height in zip(data["transmitter"], heights, strict=True):
-        transmitter["position_enu_m"] = (*transmitter["position_enu_m"][:2], height)
-    for k, heliostat in enumerate(data["heliostat"]):
-        heliostat["pivot_enu_m"] = (*heliostat["pivot_enu_m"][:2], 2.0 + (-1.0) ** k * pivot_height_m)
-    return Scenario.model_validate(data)
+    plain = site({"receiver_delay_sigma_s": 0.0}, {"frame_count": 3})
+    place, pivot = plain.transmitter_enu_m.copy(), plain.pivot_enu_m.copy()
+    place[:, 2] = 2.0 + thickness_m * np.random.default_rng(5).uniform(-0.5, 0.5, len(place))
+    pivot[:, 2] = 2.0 + (-1.0) ** np.arange(len(pivot)) * pivot_height_m
+    heliostat = [h.changed(pivot_enu_m=p) for h, p in zip(plain.heliostat, pivot, strict=True)]
+    return plain.with_transmitters(place).changed(heliostat=heliostat)
 
 
 def test_mirrors_among_level_transmitters_have_an_image_and_say_so(tmp_path: Path) -> None:
@@ -263,10 +259,10 @@ def test_interference_is_left_out_with_its_reason(clean: Path, tmp_path: Path) -
 
 
 def test_a_transmitter_elsewhere_than_surveyed_is_left_out(clean: Path, tmp_path: Path) -> None:
-    data = load_scenario(clean.with_suffix(".toml")).model_dump(exclude_none=True)
-    east, north, up = data["transmitter"][6]["position_enu_m"]
-    data["transmitter"][6]["position_enu_m"] = (east + 0.5, north, up)
-    (tmp_path / "moved.toml").write_text(Scenario.model_validate(data).to_toml())
+    told = load_scenario(clean.with_suffix(".toml"))
+    place = told.transmitter_enu_m.copy()
+    place[6, 0] += 0.5
+    told.with_transmitters(place).save(tmp_path / "moved.toml")
     result = process(clean, tmp_path / "r.h5", scenario=tmp_path / "moved.toml", estimator="correlator")
     excluded = summarise(result)["integrity"]["excluded"]
     assert list(excluded) == ["T7"]
@@ -275,10 +271,10 @@ def test_a_transmitter_elsewhere_than_surveyed_is_left_out(clean: Path, tmp_path
 
 
 def test_a_pivot_that_contradicts_the_data_is_flagged_not_averaged(clean: Path, tmp_path: Path) -> None:
-    data = load_scenario(clean.with_suffix(".toml")).model_dump(exclude_none=True)
-    east, north, up = data["heliostat"][2]["pivot_enu_m"]
-    data["heliostat"][2]["pivot_enu_m"] = (east + 0.3, north, up)
-    (tmp_path / "off.toml").write_text(Scenario.model_validate(data).to_toml())
+    told = load_scenario(clean.with_suffix(".toml"))
+    heliostat = list(told.heliostat)
+    heliostat[2] = heliostat[2].changed(pivot_enu_m=np.add(heliostat[2].pivot_enu_m, (0.3, 0.0, 0.0)))
+    told.changed(heliostat=heliostat).save(tmp_path / "off.toml")
     result = process(clean, tmp_path / "r.h5", scenario=tmp_path / "off.toml", estimator="correlator")
     table = result.integrity
     assert table is not None
@@ -309,11 +305,8 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Result:
         "tone_snr_db": 57.3,  # 0.97 mm of each range, as in the paper on a field of this size
     }
     scenario = site(mirror, simulation, tone_hz=(0.75e6,))
-    data = scenario.model_dump(exclude_none=True)
-    data["radio"]["frame_samples"] = 8000
-    for heliostat, pivot in zip(data["heliostat"], OUTER, strict=True):
-        heliostat["pivot_enu_m"] = (*pivot, 2.0)
-    scenario = Scenario.model_validate(data)
+    heliostat = [h.changed(pivot_enu_m=(*p, 2.0)) for h, p in zip(scenario.heliostat, OUTER, strict=True)]
+    scenario = scenario.changed(radio={"frame_samples": 8000}, heliostat=heliostat)
     path = recorded(scenario, tmp_path_factory.mktemp("delays"), "drift")
     return process(path, path.with_name("r.h5"), estimator="correlator")
 
@@ -322,12 +315,9 @@ def test_learned_delays_reach_the_shared_clock(learned: Result) -> None:
     assert learned.truth is not None
     found = evaluate(learned)
     assert found.failed == 0
-    data = learned.scenario.model_dump(exclude_none=True)
-    for heliostat in data["heliostat"]:
-        del heliostat["receiver_delay_drift_s_per_sqrt_min"]
-        heliostat["receiver_delay_sigma_s"] = 0.0
+    known = {"receiver_delay_drift_s_per_sqrt_min": None, "receiver_delay_sigma_s": 0.0}
     shared = normal_bound_rad(
-        Scenario.model_validate(data),
+        learned.scenario.changed(heliostat=known),
         PoseChoice(pose="rigid", reflection="none", integrity=True),
         phase_noise(learned, learned.truth, np.arange(60)),
         normal_enu=learned.truth.normal_enu,
@@ -371,23 +361,20 @@ def test_delays_learned_are_the_same_from_the_file(learned: Result, tmp_path: Pa
 # -- sites that cannot be right ------------------------------------------------------------------------------
 
 
-def _with(table: dict[str, Any]) -> Scenario:
-    return Scenario.model_validate(site({}, {}).model_dump(exclude_none=True) | table)
-
-
 def test_a_transmitter_below_the_ground_is_named() -> None:
     with pytest.raises(GeometryError, match=r"transmitter `T1` lies 5 m behind reflector `ground`.*height_m"):
-        check_solvable(_with({"reflection": {"model": "estimate", "height_m": 25.0}}), pose="rigid")
+        check_solvable(site({}, {}).changed(reflection={"model": "estimate", "height_m": 25.0}), pose="rigid")
     wall = {"name": "wall", "point_enu_m": (0.0, 30.0, 0.0), "normal_enu": (0.0, 1.0, 0.0)}
     with pytest.raises(GeometryError, match="behind reflector `wall`"):
-        check_solvable(_with({"reflection": {"model": "estimate", "plane": [wall]}}), pose="rigid")
+        check_solvable(site({}, {}).changed(reflection={"model": "estimate", "plane": [wall]}), pose="rigid")
 
 
 def test_two_mirrors_with_one_receiver_are_named() -> None:
-    data = site({}, {}).model_dump(exclude_none=True)
-    data["heliostat"][1]["receiver_ids"] = ("H02_r0", "H01_r1", "H02_r2")
+    plain = site({}, {})
+    one, other, *more = plain.heliostat
+    other = other.changed(receiver_ids=("H02_r0", "H01_r1", "H02_r2"))
     with pytest.raises(ValueError, match=r"receiver `H01_r1` appears twice: .*heliostat `H01` and to heliostat `H02`"):
-        Scenario.model_validate(data)
+        plain.changed(heliostat=[one, other, *more])
 
 
 @pytest.mark.parametrize(
@@ -404,7 +391,7 @@ def test_two_mirrors_with_one_receiver_are_named() -> None:
 )
 def test_contradictory_reflections_are_refused(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        _with({"reflection": table})
+        site({}, {}).changed(reflection=table)
 
 
 @pytest.mark.parametrize("mirror", [{"receiver_delay_sigma_s": 0.0}, {"oscillator": "separate"}])

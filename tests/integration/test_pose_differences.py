@@ -28,19 +28,19 @@ DRIFT_RAD = 0.1
 
 
 def site(mirror: dict[str, Any], *, drift_rad: float = DRIFT_RAD, calibration: bool = True) -> Scenario:
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
-    data["heliostat"] = [{**h, "pivot_sigma_m": 0.005, **mirror} for h in data["heliostat"][:4]]
-    data["radio"] |= {"frame_samples": 4000, "clock_search_ppm": 2.0}
-    if not calibration:
-        data["calibration_receiver"] = []
-    data["simulation"] |= {
-        "frame_count": N_FRAME,
-        "frame_interval_s": 3600.0 / N_FRAME,
-        "tone_snr_db": 60.0,
-        "sun_azimuth_deg": 170.0,
-        "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,
-    }
-    return Scenario.model_validate(data)
+    shipped = load_scenario(SHIPPED)
+    return shipped.changed(
+        heliostat=[h.changed(**{"pivot_sigma_m": 0.005, **mirror}) for h in shipped.heliostat[:4]],
+        radio={"frame_samples": 4000, "clock_search_ppm": 2.0},
+        calibration_receiver=shipped.calibration_receiver if calibration else [],
+        simulation={
+            "frame_count": N_FRAME,
+            "frame_interval_s": 3600.0 / N_FRAME,
+            "tone_snr_db": 60.0,
+            "sun_azimuth_deg": 170.0,
+            "transmitter_phase_drift_rad_per_sqrt_h": drift_rad,
+        },
+    )
 
 
 def solved(directory: Path, mirror: dict[str, Any], *, drift_rad: float) -> Result:
@@ -92,13 +92,13 @@ def test_calibration_receivers_of_a_recording_can_be_left_alone(tmp_path: Path) 
 
 
 def test_an_old_calibration_does_no_harm(tmp_path: Path) -> None:
-    data = site(CLOCKS["one clock"]).model_dump(exclude_none=True)
-    data["simulation"]["dropped"] = [
-        {"receiver": c["id"], "frame": f, "first_sample": 0, "sample_count": 4000}
-        for c in data["calibration_receiver"]
+    whole = site(CLOCKS["one clock"])
+    dropped = [
+        {"receiver": c.id, "frame": f, "first_sample": 0, "sample_count": 4000}
+        for c in whole.calibration_receiver
         for f in range(3, N_FRAME)
     ]
-    (tmp_path / "site.toml").write_text(Scenario.model_validate(data).to_toml())
+    whole.changed(simulation={"dropped": dropped}).save(tmp_path / "site.toml")
     simulate(tmp_path / "site.toml", seed=5).save(tmp_path / "rec.h5")
     rigid = evaluate(process(tmp_path / "rec.h5", tmp_path / "r.h5", estimator="correlator"))
     fits = evaluate(process(tmp_path / "rec.h5", tmp_path / "i.h5", estimator="correlator", pose="independent"))
@@ -108,22 +108,27 @@ def test_an_old_calibration_does_no_harm(tmp_path: Path) -> None:
     assert fits.normal_error_mrad.rms > 1000.0 * rigid.normal_error_mrad.rms
 
 
-def _not_surveyed(data: dict[str, Any]) -> None:
-    del data["heliostat"][1]["pivot_sigma_m"]
+def _as_it_is(plain: Scenario) -> Scenario:
+    return plain
 
 
-def _reflecting(data: dict[str, Any]) -> None:
-    data["reflection"] = {"model": "estimate"}
+def _not_surveyed(plain: Scenario) -> Scenario:
+    one, other, *more = plain.heliostat
+    return plain.changed(heliostat=[one, other.changed(pivot_sigma_m=None), *more])
 
 
-def _short_tone(data: dict[str, Any]) -> None:
-    data["tone"][0]["frequency_hz"] = 60e6
+def _reflecting(plain: Scenario) -> Scenario:
+    return plain.changed(reflection={"model": "estimate"})
+
+
+def _short_tone(plain: Scenario) -> Scenario:
+    return plain.changed(tone={"frequency_hz": 60e6}, radio={"sample_rate_hz": 400e6})
 
 
 @pytest.mark.parametrize(
     ("pose", "change", "error", "message"),
     [
-        ("independent", None, ScenarioError, "no calibration receiver, and pose `independent`.*pivot_sigma_m"),
+        ("independent", _as_it_is, ScenarioError, "no calibration receiver, and pose `independent`.*pivot_sigma_m"),
         ("rigid", _not_surveyed, ScenarioError, "no calibration receiver.*`H02`.*not surveyed.*pivot_sigma_m"),
         ("rigid", _reflecting, ScenarioError, "no calibration receiver, and reflections.*leave reflections out"),
         ("rigid", _short_tone, GeometryError, "ambiguous.*quarter.*add a tone"),
@@ -132,11 +137,7 @@ def _short_tone(data: dict[str, Any]) -> None:
 def test_what_cannot_do_without_calibration_is_refused(
     pose: str, change: Any, error: type[Exception], message: str
 ) -> None:
-    data = site({}, calibration=False).model_dump(exclude_none=True)
-    if change is not None:
-        change(data)
-        data["radio"]["sample_rate_hz"] = 400e6
-    scenario = Scenario.model_validate(data)
+    scenario = change(site({}, calibration=False))
     with pytest.raises(error, match=message):
         check_solvable(scenario, pose=pose, choice=choose(scenario, pose=pose))
 

@@ -30,12 +30,10 @@ INTERVAL_S = 10.0
 
 def site(motion: dict[str, Any]) -> Scenario:
     """Six mirrors of the shipped field, moved by a sun that moves as at noon; noise far above a frame's turn."""
-    data = load_scenario(SHIPPED).model_dump(exclude_none=True)
+    shipped = load_scenario(SHIPPED)
     mirror = {"pivot_sigma_m": 0.005, "carrier_phase": False}
-    data["heliostat"] = [{**h, **mirror} for h in data["heliostat"][:6]]
-    data["radio"] |= {"frame_samples": FRAME_SAMPLES, "clock_search_ppm": 2.0}
     sun_deg = N_FRAME * INTERVAL_S * 360.0 / 86400.0
-    data["simulation"] |= {
+    simulation = {
         "frame_count": N_FRAME,
         "frame_interval_s": INTERVAL_S,
         "tone_snr_db": 75.0,
@@ -43,11 +41,16 @@ def site(motion: dict[str, Any]) -> Scenario:
         "sun_elevation_deg": 60.0,
         "dropped": [
             {"receiver": name, "frame": f, "first_sample": 0, "sample_count": FRAME_SAMPLES}
-            for name in data["heliostat"][0]["receiver_ids"]
+            for name in shipped.heliostat[0].receiver_ids
             for f in range(N_FRAME)[LOST]
         ],
     }
-    return Scenario.model_validate(data | {"motion": motion})
+    return shipped.changed(
+        heliostat=[h.changed(**mirror) for h in shipped.heliostat[:6]],
+        radio={"frame_samples": FRAME_SAMPLES, "clock_search_ppm": 2.0},
+        simulation=simulation,
+        motion=motion,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +110,8 @@ def test_the_command_line_wins_over_the_scenario() -> None:
 def test_a_filter_is_refused_where_it_would_claim_too_much() -> None:
     with pytest.raises(InvalidInputError, match="`filter` is of pose `rigid`"):
         choose(site({}), pose="independent", filtered=True)
-    data = site({}).model_dump(exclude_none=True)
-    data["heliostat"][2]["receiver_delay_drift_s_per_sqrt_min"] = 1e-12
+    plain = site({})
+    heliostat = list(plain.heliostat)
+    heliostat[2] = heliostat[2].changed(receiver_delay_drift_s_per_sqrt_min=1e-12)
     with pytest.raises(ScenarioError, match=r"H03.*common to the frames.*`filtered=False`"):
-        choose(Scenario.model_validate(data), pose="rigid", filtered=True)
+        choose(plain.changed(heliostat=heliostat), pose="rigid", filtered=True)

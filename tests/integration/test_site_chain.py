@@ -50,7 +50,7 @@ def recorded(tmp_path_factory):
     commanded = geometry.unit(truth.normal_enu[0] + aside)
     told = site.changed(
         heliostat=[
-            {**h.model_dump(exclude_none=True), "normal_enu": tuple(n), "pivot_sigma_m": 0.005}
+            h.changed(normal_enu=tuple(n), pivot_sigma_m=0.005)
             for h, n in zip(site.heliostat, commanded.tolist(), strict=True)
         ],
         reflection={"model": "fresnel", "permittivity": 15.0, "conductivity_s_per_m": 0.01},

@@ -179,7 +179,7 @@ def test_receivers_that_are_turned_turn_the_normal() -> None:
 def test_a_shift_of_all_transmitters_turns_mirrors_only_where_pivots_are_held() -> None:
     """All transmitters moved are all mirrors moved the other way: exact where nothing is known of pivots."""
     scenario = site(ground=False, plate=False, floor=1e-5)
-    free = scenario.changed(heliostat=[{**h.model_dump(), "pivot_sigma_m": 10.0} for h in scenario.heliostat])
+    free = scenario.changed(heliostat={"pivot_sigma_m": 10.0})
     rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
     shift = np.tile([1e-4, -2e-4, 1e-4], (len(scenario.transmitter), 1))
     change = {}
@@ -199,12 +199,7 @@ def test_moved_transmitters_are_received_as_if_foreseen_anew() -> None:
     scenario = site(ground=True, plate=False)
     rot = geometry.rot_enu_from_mirror(np.array([m.normal_enu for m in scenario.mirrors]))
     shift = 1e-3 * np.random.default_rng(2).normal(size=(len(scenario.transmitter), 3))
-    moved = scenario.changed(
-        transmitter=[
-            {**t.model_dump(exclude_none=True), "position_enu_m": tuple(np.asarray(t.position_enu_m) + d)}
-            for t, d in zip(scenario.transmitter, shift, strict=True)
-        ]
-    )
+    moved = scenario.with_transmitters(scenario.transmitter_enu_m + shift)
     ((_, before),), ((_, after),) = foreseen_mirrors(scenario, rot), foreseen_mirrors(moved, rot)
     ratio = before.received(WorldErrors(transmitter_m=shift)) / after.received()
     change = before.received() / after.received()
@@ -218,12 +213,12 @@ def test_a_wall_shifts_ranges_as_its_image_says() -> None:
     table2 = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     wall_m = 8.0
     transmitter = [
-        {**t.model_dump(exclude_none=True), "position_enu_m": (-20.0 - 8.0 * i, *rng.uniform([-30, 5], [30, 20]))}
+        t.changed(position_enu_m=(-20.0 - 8.0 * i, *rng.uniform([-30, 5], [30, 20])))
         for i, t in enumerate(table2.transmitter)
     ]
     scenario = table2.changed(
         heliostat=[
-            {**h.model_dump(exclude_none=True), "pivot_enu_m": (0.0, 6.0 * i, 4.0), "normal_enu": (0.0, 0.0, 1.0)}
+            h.changed(pivot_enu_m=(0.0, 6.0 * i, 4.0), normal_enu=(0.0, 0.0, 1.0))
             for i, h in enumerate(table2.heliostat[:3])
         ],
         transmitter=transmitter,
@@ -295,16 +290,18 @@ def test_a_second_carrier_of_an_antenna_tells_nothing_new_of_reflections_at_the_
         of_rays = [np.trace(foreseen.share(kind), axis1=1, axis2=2).sum() for kind in ("specular", "diffracted")]
         return float(np.trace(foreseen.poses().normal_cov, axis1=1, axis2=2).sum()), float(sum(of_rays))
 
-    each = [t.model_dump(exclude_none=True) for t in one.transmitter]
     found: dict[str, tuple[float, float]] = {"one": told(one)}
     for name, place, mast in (("same", 0.0, True), ("other", 1e-4, False)):
         more = [
-            {**t, "id": f"{t['id']}b", "carrier_hz": t["carrier_hz"] + 30e3}
-            | {"position_enu_m": (t["position_enu_m"][0] + place, *t["position_enu_m"][1:])}
-            | ({"mast": t["id"]} if mast else {})
-            for t in each
+            t.changed(
+                id=f"{t.id}b",
+                carrier_hz=t.carrier_hz + 30e3,
+                position_enu_m=np.add(t.position_enu_m, (place, 0.0, 0.0)),
+                mast=t.id if mast else None,
+            )
+            for t in one.transmitter
         ]
-        found[name] = told(one.changed(transmitter=[*each, *more]))
+        found[name] = told(one.changed(transmitter=[*one.transmitter, *more]))
     assert found["same"] == pytest.approx(found["one"], rel=0.02)
     assert found["other"][0] < 0.7 * found["one"][0]
     assert found["other"][1] < 0.7 * found["one"][1]
@@ -313,11 +310,10 @@ def test_a_second_carrier_of_an_antenna_tells_nothing_new_of_reflections_at_the_
 def test_carriers_far_apart_are_witnesses_of_their_own() -> None:
     one = site(ground=False, plate=False)
     wide = one.changed(radio={"sample_rate_hz": 1.2e9, "frame_samples": 1_000_000})
-    each = [t.model_dump(exclude_none=True) for t in wide.transmitter]
-    more = [{**t, "id": f"{t['id']}b", "mast": t["id"], "carrier_hz": t["carrier_hz"] + 500e6} for t in each]
+    more = [t.changed(id=f"{t.id}b", mast=t.id, carrier_hz=t.carrier_hz + 500e6) for t in wide.transmitter]
     told = [
         np.sqrt(np.mean(layout_map(s, estimators=["site"]).rms_mrad["site"] ** 2))
-        for s in (wide, wide.changed(transmitter=[*each, *more]))
+        for s in (wide, wide.changed(transmitter=[*wide.transmitter, *more]))
     ]
     # 500 MHz are ten times what a detour of a metre needs, and at the higher frequency a phase is worth less length
     assert told[1] < 0.7 * told[0]

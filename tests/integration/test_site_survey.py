@@ -25,10 +25,7 @@ from rfpose.recording import frame_starts
 def site():
     base = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     return base.changed(
-        heliostat=[
-            {**h.model_dump(exclude_none=True), "pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
-            for h in base.heliostat[:3]
-        ],
+        heliostat=[h.changed(pivot_sigma_m=0.003, receiver_delay_sigma_s=0.0) for h in base.heliostat[:3]],
         site={"aim_enu_m": [0.0, 0.0, 50.0]},
         radio={"frame_samples": 20_000, "centre_frequency_hz": 433e6},
         posture={"sigma_rad": 0.005},
@@ -42,10 +39,7 @@ def recording(site):
     rng = np.random.default_rng(4)
     built = site.changed(
         heliostat=[
-            {
-                **h.model_dump(exclude_none=True),
-                "receiver_mirror_m": (np.array(h.receiver_mirror_m) + 1e-3 * rng.standard_normal((3, 3))).tolist(),
-            }
+            h.changed(receiver_mirror_m=(np.array(h.receiver_mirror_m) + 1e-3 * rng.standard_normal((3, 3))).tolist())
             for h in site.heliostat
         ]
     )
@@ -109,7 +103,7 @@ def test_what_was_written_comes_back(surveyed):
 def test_all_that_was_surveyed_gets_into_the_scenario(site, surveyed):
     found = read_survey(surveyed)
     told = site.changed(
-        transmitter=[{**t.model_dump(exclude_none=True), "survey_sigma_m": 0.01} for t in site.transmitter],
+        transmitter=[t.changed(survey_sigma_m=0.01) for t in site.transmitter],
         reflection={"model": "fresnel", "permittivity": 10.0, "conductivity_s_per_m": 0.01},
     )
     moved = np.add(site.transmitter_enu_m, (0.01, -0.02, 0.03))
@@ -132,9 +126,7 @@ def test_all_that_was_surveyed_gets_into_the_scenario(site, surveyed):
 
 def changed(site, i, **keys):
     """The heliostats of a site, one of them otherwise."""
-    heliostats = [h.model_dump(exclude_none=True) for h in site.heliostat]
-    heliostats[i].update(keys)
-    return site.changed(heliostat=heliostats)
+    return site.changed(heliostat=[h.changed(**keys) if k == i else h for k, h in enumerate(site.heliostat)])
 
 
 OTHERS = {
@@ -150,11 +142,11 @@ OTHERS = {
         site, 0, pivot_enu_m=tuple(np.add(site.heliostat[0].pivot_enu_m, (1.0, 0.0, 0.0)))
     ),
     "no transmitter `Y`": lambda site: site.changed(
-        transmitter=[{**site.transmitter[0].model_dump(exclude_none=True), "id": "Y"}, *site.transmitter[1:]]
+        transmitter=[site.transmitter[0].changed(id="Y"), *site.transmitter[1:]]
     ),
     "transmitter `T1` is": lambda site: site.changed(
         transmitter=[
-            {**site.transmitter[0].model_dump(exclude_none=True), "position_enu_m": (90.0, 1.0, 20.0)},
+            site.transmitter[0].changed(position_enu_m=(90.0, 1.0, 20.0)),
             *site.transmitter[1:],
         ]
     ),
@@ -175,8 +167,7 @@ def test_surveyed_delays_are_taken_out_of_what_is_processed(site, tmp_path):
     sigma_s = 3e-11  # a centimetre
     built = site.changed(simulation={"receiver_delay_s": sigma_s})
     recording = rf.simulate(built, seed=3)
-    heliostats = [{**h.model_dump(exclude_none=True), "receiver_delay_sigma_s": sigma_s} for h in site.heliostat]
-    told = site.changed(heliostat=heliostats)
+    told = site.changed(heliostat={"receiver_delay_sigma_s": sigma_s})
     found = rf.survey(recording, tmp_path / "delays.h5", scenario=told)
     true = 299_792_458.0 * recording.truth.receiver_delay_s[0, :9].reshape(3, 3)
     off = found.delay_m - true

@@ -15,15 +15,11 @@ DATA = Path(__file__).resolve().parents[2] / "data" / "tracking_100m.toml"
 
 def scenario(*changes, **tracking):
     """The shipped scenario between nine and ten o'clock without field control, with keys of [tracking] replaced."""
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    table = data["tracking"] | {"first_hour": 9.0, "last_hour": 9.75, "settle_s": 240.0}
-    table.pop("field_control", None)
-    for change in (*changes, tracking):
-        for key, value in change.items():
-            table[key] = {**table[key], **value} if isinstance(value, dict) else value
-    data["tracking"] = table
-    return type(base).model_validate(data)
+    site = load_scenario(DATA)
+    hour = {"first_hour": 9.0, "last_hour": 9.75, "settle_s": 240.0, "field_control": None}
+    for change in (hour, *changes, tracking):
+        site = site.changed(tracking=change)
+    return site
 
 
 def run(site, methods, *, count=None, seed=1):

@@ -26,18 +26,11 @@ HALF_HOUR = {"first_hour": 11.5, "last_hour": 12.0, "store_interval_s": 4.0}
 
 def scenario(*changes, events=(), bus=None, without=False, **tracking):
     """The shipped scenario with keys of [tracking] replaced; `bus` and events as on the command line."""
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    table = data["tracking"]
-    table["field_control"]["bus"]["lost"] = 0.0
-    for change in (*changes, tracking, {"field_control": {"bus": bus or {"lost": 0.0}}}):
-        for key, value in change.items():
-            old = table.get(key)
-            table[key] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
-    table["event"] = [_event(text) for text in events]
-    if without:
-        del table["field_control"]
-    return type(base).model_validate(data)
+    site = load_scenario(DATA)
+    for change in (*changes, tracking, {"field_control": {"bus": {"lost": 0.0, **(bus or {})}}}):
+        site = site.changed(tracking=change)
+    site = site.changed(tracking={"event": [_event(text) for text in events]})
+    return site.changed(tracking={"field_control": None}) if without else site
 
 
 def run(site, methods=("open-loop",), *, count=3, seed=1):

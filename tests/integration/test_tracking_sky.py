@@ -17,11 +17,8 @@ CLOUDY = 11
 
 
 def scenario(**tracking):
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    data["tracking"].pop("field_control", None)
-    data["tracking"] |= {"sky": "bursts", "first_hour": 9.0, "last_hour": 10.25} | tracking
-    return type(base).model_validate(data)
+    hours = {"first_hour": 9.0, "last_hour": 10.25, "field_control": None}
+    return load_scenario(DATA).changed(tracking={"sky": "bursts", **hours, **tracking})
 
 
 def run(site, methods, *, seed=CLOUDY):

@@ -10,7 +10,7 @@ import numpy as np
 from rfpose.feedback.columns import PARAMETERS, constant
 from rfpose.feedback.mount import Actuator, Mount, posture
 from rfpose.feedback.tracking import TrackingSimulation
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -23,29 +23,30 @@ from rfpose.scenario import load_scenario
 base = load_scenario(sys.argv[1])
 found = {}
 for collector, methods in (("heliostat", ("open-loop", "encoder", "radio-both")), ("dish", ("sun-sensor", "radio"))):
-    data = base.model_dump(exclude_none=True)
-    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "collector": collector}
-    data["tracking"]["radio"]["outages"] = ({"first_hour": 9.02, "last_hour": 9.035},)
-    data["tracking"]["radio"] |= {"ground": "none", "plate_calibration": "none"}
-    data["tracking"]["radio_model"] |= {"points_per_day": 8, "learn_interval_s": 20.0}
-    simulation = TrackingSimulation(type(base).model_validate(data), methods=methods, count=2, seed=4)
+    site = base.changed(tracking={
+        "first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "collector": collector,
+        "radio": {"outages": [{"first_hour": 9.02, "last_hour": 9.035}], "ground": "none", "plate_calibration": "none"},
+        "radio_model": {"points_per_day": 8, "learn_interval_s": 20.0},
+    })
+    simulation = TrackingSimulation(site, methods=methods, count=2, seed=4)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     for name, values in simulation.state().items():
         found[f"{collector}/{name}"] = values
 # orders: a defocus, an emergency, mirrors that swing and carry the sun on, or hold it
 for between in ("carried-on", "held"):
-    data = base.model_dump(exclude_none=True)
-    data["tracking"] |= {"first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "store_interval_s": 4.0}
-    data["tracking"]["drive"] |= {"speed_mradps": 200.0}
-    data["tracking"]["field_control"] |= {"between_messages": between, "emergency_hold_s": 8.0}
-    data["tracking"]["structure"] = {"natural_hz": 2.2, "damping": 0.05}
-    data["tracking"]["radio"] |= {"ground": "none", "plate_calibration": "none"}
-    data["tracking"]["event"] = [
-        {"hour": 9.008, "what": "defocus", "heliostats": ("H02",)},
-        {"hour": 9.016, "what": "emergency"}, {"hour": 9.028, "what": "release"},
-    ]
-    simulation = TrackingSimulation(type(base).model_validate(data), methods=("open-loop", "radio"), count=2, seed=4)
+    site = base.changed(tracking={
+        "first_hour": 9.0, "last_hour": 9.05, "settle_s": 0.0, "store_interval_s": 4.0,
+        "drive": {"speed_mradps": 200.0},
+        "field_control": {"between_messages": between, "emergency_hold_s": 8.0},
+        "structure": {"natural_hz": 2.2, "damping": 0.05},
+        "radio": {"ground": "none", "plate_calibration": "none"},
+        "event": [
+            {"hour": 9.008, "what": "defocus", "heliostats": ("H02",)},
+            {"hour": 9.016, "what": "emergency"}, {"hour": 9.028, "what": "release"},
+        ],
+    })
+    simulation = TrackingSimulation(site, methods=("open-loop", "radio"), count=2, seed=4)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     modes = simulation.curves("radio").mode
@@ -78,14 +79,12 @@ def test_compiled_equals_plain_python(tmp_path):
 
 
 def test_mirrors_stand_as_their_mounts_say_by_the_names_of_parameters():
-    data = load_scenario(ROOT / "data" / "tracking_100m.toml").model_dump(exclude_none=True)
-    data["tracking"] |= {
+    site = load_scenario(ROOT / "data" / "tracking_100m.toml").changed(tracking={
         "first_hour": 9.0, "last_hour": 9.05, "store_interval_s": 16.0, "stored": 3, "wind": {"mean_speed_mps": 0.0},
-        "structure": {"natural_hz": 0.0}, "drive": {"backlash_mrad": (0.0, 0.0)},
+        "structure": {"natural_hz": 0.0}, "drive": {"backlash_mrad": (0.0, 0.0)}, "field_control": None,
         "mount_errors": {"thermal_sigma_mrad": 3.0, "sag_sigma_mrad": 2.0, "worm_sigma_mrad": 2.0},
-    }  # fmt: skip
-    del data["tracking"]["field_control"]
-    simulation = TrackingSimulation(Scenario.model_validate(data), methods=("open-loop",), count=3, seed=2)
+    })  # fmt: skip
+    simulation = TrackingSimulation(site, methods=("open-loop",), count=3, seed=2)
     while simulation.done < simulation.n_segment:
         simulation.advance()
     field, day, curves = simulation.field, simulation.days[0], simulation.curves("open-loop")

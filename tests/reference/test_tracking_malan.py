@@ -27,19 +27,20 @@ TABLE_6_1 = {
 
 def malan(*, worm_rad=0.0, fit_worm=False):
     base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    data["site"] |= {"aim_enu_m": (0.0, 0.0, 13.0)}
-    data["heliostat"] = [data["heliostat"][0] | {"pivot_enu_m": (19.2, -30.8, 1.2), "arm_m": 0.0}]
-    table = data["tracking"]
-    table["date"] = datetime.date(2012, 9, 6)
-    table["mount_errors"] |= {
-        "thermal_sigma_mrad": 0.0,
-        "creep_sigma_mrad_per_month": 0.0,
-        "fixed": {**TABLE_6_1, "worm_2_sin_rad": worm_rad, "worm_2_cos_rad": 0.0},
-    }
-    table["drive"] |= {"microsteps": 8}
-    table["camera"] |= {"interval_days": 8.0, "points_per_day": 20, "spot_sigma_mm": 10.0, "worm": fit_worm}
-    return type(base).model_validate(data)
+    return base.changed(
+        site={"aim_enu_m": (0.0, 0.0, 13.0)},
+        heliostat=[base.heliostat[0].changed(pivot_enu_m=(19.2, -30.8, 1.2), arm_m=0.0)],
+        tracking={
+            "date": datetime.date(2012, 9, 6),
+            "mount_errors": {
+                "thermal_sigma_mrad": 0.0,
+                "creep_sigma_mrad_per_month": 0.0,
+                "fixed": {**TABLE_6_1, "worm_2_sin_rad": worm_rad, "worm_2_cos_rad": 0.0},
+            },
+            "drive": {"microsteps": 8},
+            "camera": {"interval_days": 8.0, "points_per_day": 20, "spot_sigma_mm": 10.0, "worm": fit_worm},
+        },
+    )
 
 
 def rms_mrad(scenario, method):

@@ -164,8 +164,7 @@ def test_receivers_are_found_by_name_and_place(site, tmp_path):
 
 def test_one_table_a_frame(site, tmp_path):
     moving = {"frame_count": 2, "frame_interval_s": 60.0, "sun_azimuth_deg": (120.0, 240.0), "sun_elevation_deg": 40.0}
-    heliostats = [h.model_dump(exclude_none=True, exclude={"normal_enu"}) for h in site.heliostat]
-    site = site.changed(heliostat=heliostats, simulation=moving)
+    site = site.changed(heliostat={"normal_enu": None}, simulation=moving)
     files = [str(save(tmp_path / f"{k}.npz", table_of(site, k))) for k in (0, 1)]
     got = Simulator(site.changed(simulation={"paths": files}), seed=3)
     ground = {"ground": {"coefficient": [-0.3, 0.1]}, "path_loss": "free_space"}

@@ -59,10 +59,7 @@ QUIET = {"tone_snr_db": 300.0, "sample_format": "complex64", "frame_count": 1}
 
 
 def scenario_with(text=SITE, **simulation):
-    base = parse_scenario(text)
-    data = base.model_dump(exclude_none=True)
-    data["simulation"] = data["simulation"] | simulation
-    return type(base).model_validate(data)
+    return parse_scenario(text).changed(simulation=simulation)
 
 
 def make(seed=1, text=SITE, **simulation):

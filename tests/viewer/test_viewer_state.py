@@ -15,7 +15,7 @@ from rfpose.multilat.integrity import TransmitterStatus
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.formats.result_file import open_result
 from rfpose.pipeline.pictures.field_view import history, project
-from rfpose.scenario import Scenario, load_scenario, parse_scenario
+from rfpose.scenario import load_scenario, parse_scenario
 from rfpose.viewer.state.document import open_document
 from rfpose.viewer.state.layout_edit import LayoutEdit
 from rfpose.viewer.state.observed import Signal
@@ -101,9 +101,9 @@ def test_added_transmitter_gets_a_carrier_that_the_scenario_allows(edit: LayoutE
 
 
 def test_full_band_is_said() -> None:
-    data = load_scenario(shipped_scenario("table2_100m.toml")).model_dump(exclude_none=True)
-    data["radio"]["frame_samples"] = 200  # lines must be 400 kHz apart
-    edit = LayoutEdit(Scenario.model_validate(data))
+    # lines must be 400 kHz apart
+    site = load_scenario(shipped_scenario("table2_100m.toml")).changed(radio={"frame_samples": 200})
+    edit = LayoutEdit(site)
 
     def fill() -> None:
         for _ in range(100):
@@ -111,8 +111,7 @@ def test_full_band_is_said() -> None:
 
     with pytest.raises(ScenarioError, match="no room for another carrier"):
         fill()
-    Scenario.model_validate(data | {"transmitter": [t.model_dump() | {"position_enu_m": (float(k), 0.0, 0.0)}
-                                                    for k, t in enumerate(edit.transmitters)]})  # fmt: skip
+    site.changed(transmitter=[t.changed(position_enu_m=(k, 0.0, 0.0)) for k, t in enumerate(edit.transmitters)])
 
 
 def test_saving_a_layout_that_contradicts_itself_names_what(edit: LayoutEdit) -> None:

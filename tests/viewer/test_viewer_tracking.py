@@ -46,9 +46,8 @@ EVENTS = (
 
 def short_day() -> Scenario:
     """From stow to stow in four hours about noon."""
-    data = load_scenario(shipped_scenario("tracking_100m.toml")).model_dump(exclude_none=True)
-    data["tracking"]["min_sun_elevation_deg"] = 50.0
-    return Scenario.model_validate(data)
+    site = load_scenario(shipped_scenario("tracking_100m.toml"))
+    return site.changed(tracking={"min_sun_elevation_deg": 50.0})
 
 
 @pytest.fixture(scope="module")

@@ -90,7 +90,7 @@ def survey(
     >>> site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     >>> mirror = {"pivot_sigma_m": 0.003, "receiver_delay_sigma_s": 0.0}
     >>> site = site.changed(
-    ...     heliostat=[{**h.model_dump(exclude_none=True), **mirror} for h in site.heliostat[:2]],
+    ...     heliostat=[h.changed(**mirror) for h in site.heliostat[:2]],
     ...     radio={"frame_samples": 20_000, "centre_frequency_hz": 433e6},
     ...     multipath={"foresee": [], "visibility": False},
     ... )
@@ -233,12 +233,8 @@ def _survey_group(
             )
 
     def field_for(now: SurveyConstants) -> FieldAt:
-        moved = site.changed(
-            transmitter=[
-                {**t.model_dump(exclude_none=True), "position_enu_m": place}
-                for t, place in zip(site.transmitter, now.transmitter_enu_m.tolist(), strict=True)
-            ]
-        )
+        placed = zip(site.transmitter, now.transmitter_enu_m, strict=True)
+        moved = site.changed(transmitter=[t.changed(position_enu_m=place) for t, place in placed])
         there = replace(group, places_m=now.receiver_mirror_m, pivot_enu_m=now.pivot_enu_m)
         return SiteField(moved, there, standing, antenna)
 

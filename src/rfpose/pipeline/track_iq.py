@@ -155,10 +155,10 @@ def _rms(parts: FloatArray) -> float:
 
 def _postures(scenario: Scenario, i_heliostat: int, normal_enu: FloatArray) -> Scenario:
     """Return the scenario with one mirror standing in each posture."""
-    like = scenario.heliostat[i_heliostat].model_dump(exclude_none=True)
-    receivers = range(len(like["receiver_mirror_m"]))
+    like = scenario.heliostat[i_heliostat]
+    receivers = range(len(like.receiver_mirror_m))
     heliostats = [
-        {**like, "id": f"P{k}", "normal_enu": n, "receiver_ids": [f"P{k}_r{r}" for r in receivers]}
-        for k, n in enumerate(normal_enu.tolist())
+        like.changed(id=f"P{k}", normal_enu=n, receiver_ids=[f"P{k}_r{r}" for r in receivers])
+        for k, n in enumerate(normal_enu)
     ]
     return scenario.changed(heliostat=heliostats, simulation={"frame_count": 1, "blocked": None, "dropped": None})

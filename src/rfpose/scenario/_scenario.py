@@ -319,7 +319,7 @@ class Scenario(Record):
 
     # -- another scenario --------------------------------------------------------------------------------
 
-    def changed(self, **tables: Any) -> Scenario:
+    def changed(self, **tables: Any) -> Self:
         """Return the scenario with some of its tables changed, and checked as a file is.
 
         Parameters
@@ -343,8 +343,13 @@ class Scenario(Record):
         (('H01', 'H02', 'H03'), 2)
         >>> [mirror.pivot_sigma_m for mirror in short.changed(heliostat={"pivot_sigma_m": 0.005}).heliostat]
         [0.005, 0.005, 0.005]
+
+        Each record in it can be changed alone:
+
+        >>> short.changed(heliostat=[mirror.changed(arm_m=0.2) for mirror in short.heliostat]).heliostat[0].arm_m
+        0.2
         """
-        return check_scenario(_merged(self.model_dump(exclude_none=True), tables))
+        return super().changed(**tables)
 
     def with_field(self, field: str | Path | npt.ArrayLike, *, ids: Sequence[str] | None = None) -> Scenario:
         """Return the scenario with another field, each heliostat like the first, its own posture left out.
@@ -502,27 +507,3 @@ def check_scenario(data: Mapping[str, Any]) -> Scenario:
         return Scenario.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(in_words(error)) from error
-
-
-def _merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain values with those of ``new`` in place of the old; tables go into each other, None takes away."""
-    out = dict(old)
-    for key, value in new.items():
-        if value is None:
-            out.pop(key, None)
-        elif isinstance(value, Mapping):
-            inner = out.get(key, {})
-            out[key] = [_merged(each, value) for each in inner] if isinstance(inner, tuple) else _merged(inner, value)
-        else:
-            out[key] = _plain(value)
-    return out
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Record):
-        return value.model_dump(exclude_none=True)
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value

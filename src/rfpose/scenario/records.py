@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from fractions import Fraction
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rfpose import geometry
+from rfpose.errors import ScenarioError
 from rfpose.foreign import RATE_LIMITS, exact_rate
+from rfpose.scenario._words import in_words
 
 SPEED_OF_LIGHT_MPS = 299_792_458.0
 MAX_FRAME_SAMPLES = 2**24
@@ -32,6 +36,37 @@ class Record(BaseModel):
     """Frozen, refuses unknown keys, NaN and infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def changed(self, **values: Any) -> Self:
+        """Return the record with some of its values changed, and checked as a file is; see `Scenario.changed`."""
+        try:
+            return type(self).model_validate(merged(self.model_dump(exclude_none=True), values))
+        except ValidationError as error:
+            raise ScenarioError(in_words(error)) from error
+
+
+def merged(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain values with those of ``new`` in place of the old; tables go into each other, None takes away."""
+    out = dict(old)
+    for key, value in new.items():
+        if value is None:
+            out.pop(key, None)
+        elif isinstance(value, Mapping):
+            inner = out.get(key, {})
+            out[key] = [merged(each, value) for each in inner] if isinstance(inner, tuple) else merged(inner, value)
+        else:
+            out[key] = _plain(value)
+    return out
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Record):
+        return value.model_dump(exclude_none=True)
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
 
 
 class Radio(Record):

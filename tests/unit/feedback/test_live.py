@@ -13,9 +13,8 @@ from rfpose.scenario import Scenario, load_scenario
 
 
 def scenario() -> Scenario:
-    data = load_scenario(shipped_scenario("tracking_100m.toml")).model_dump(exclude_none=True)
-    data["heliostat"] = data["heliostat"][:5]
-    return live_scenario(Scenario.model_validate(data))
+    site = load_scenario(shipped_scenario("tracking_100m.toml"))
+    return live_scenario(site.changed(heliostat=site.heliostat[:5]))
 
 
 def after(field: LiveField, seconds: float) -> FieldMoment:

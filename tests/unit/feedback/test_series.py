@@ -14,10 +14,8 @@ DATA = Path(__file__).resolve().parents[3] / "data" / "tracking_100m.toml"
 
 
 def scenario(record):
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    data["tracking"] |= {"sky": "record", "beam_record": str(record), "first_hour": 9.0, "last_hour": 11.0}
-    return type(base).model_validate(data)
+    hours = {"first_hour": 9.0, "last_hour": 11.0}
+    return load_scenario(DATA).changed(tracking={"sky": "record", "beam_record": str(record), **hours})
 
 
 def record(tmp_path, rows, unit="w_per_m2"):
@@ -64,7 +62,6 @@ def test_bad_irradiance_is_refused_by_line(tmp_path, span):
 
 
 def test_a_record_and_its_sky_belong_together():
-    base = load_scenario(DATA).model_dump(exclude_none=True)
     for change in ({"sky": "record"}, {"beam_record": "dni.csv"}):
         with pytest.raises(ValueError, match="belong together"):
-            type(load_scenario(DATA)).model_validate(base | {"tracking": base["tracking"] | change})
+            load_scenario(DATA).changed(tracking=change)

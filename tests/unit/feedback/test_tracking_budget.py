@@ -13,7 +13,7 @@ from rfpose.feedback.tracking import TrackingSimulation, score
 from rfpose.feedback.tracking.budget import SampledLoop, mean_intercept, track_budget
 from rfpose.feedback.tracking.capture import capture_table
 from rfpose.feedback.tracking.timeline import day_of
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 
 DATA = Path(__file__).resolve().parents[3] / "data" / "tracking_100m.toml"
 NO_ERRORS = {
@@ -33,13 +33,10 @@ QUIET = {
 
 def changed(hours, *changes):
     """The shipped scenario without field control, keys of [tracking] replaced."""
-    data = load_scenario(DATA).model_dump(exclude_none=True)
-    table = data["tracking"] | {"first_hour": hours[0], "last_hour": hours[1]}
-    table.pop("field_control", None)
-    for change in changes:
-        for key, value in change.items():
-            table[key] = {**table[key], **value} if isinstance(value, dict) else value
-    return Scenario.model_validate({**data, "tracking": table})
+    site = load_scenario(DATA)
+    for change in ({"first_hour": hours[0], "last_hour": hours[1], "field_control": None}, *changes):
+        site = site.changed(tracking=change)
+    return site
 
 
 def simulated(scenario, methods, count):

@@ -23,13 +23,7 @@ DATA = Path(__file__).resolve().parents[3] / "data" / "tracking_100m.toml"
 
 def changed(*, events=(), **tracking):
     """The shipped scenario with keys of [tracking] replaced."""
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    for key, value in tracking.items():
-        old = data["tracking"].get(key)
-        data["tracking"][key] = {**old, **value} if isinstance(old, dict) else value
-    data["tracking"]["event"] = [_event(text) for text in events]
-    return type(base).model_validate(data)
+    return load_scenario(DATA).changed(tracking={**tracking, "event": [_event(text) for text in events]})
 
 
 # ---- who and when -------------------------------------------------------------------------------------------------
@@ -142,11 +136,7 @@ def test_days_have_room_for_the_ways():
 
 
 def changed_without(**tracking):
-    base = load_scenario(DATA)
-    data = base.model_dump(exclude_none=True)
-    data["tracking"].pop("field_control")
-    data["tracking"] |= tracking
-    return type(base).model_validate(data)
+    return load_scenario(DATA).changed(tracking={"field_control": None, **tracking})
 
 
 def test_settings_go_through_to_field_control():
@@ -322,17 +312,13 @@ def test_tables_that_contradict_themselves_are_refused(tracking, events, words):
 
 
 def test_events_need_field_control_and_calibrations_a_target():
-    data = load_scenario(DATA).model_dump(exclude_none=True)
-    data["tracking"]["event"] = [_event("9 calibrate")]
-    kept = dict(data["tracking"]["field_control"])
-    del data["tracking"]["field_control"]["calibration_target_enu_m"]
+    event = [_event("9 calibrate")]
+    aimless = {"calibration_target_enu_m": None}
     with pytest.raises(ValueError, match=r"`calibrate` needs a target: set .*`calibration_target_enu_m`"):
-        type(load_scenario(DATA)).model_validate(data)
-    data["tracking"]["field_control"] = kept
-    type(load_scenario(DATA)).model_validate(data)
-    del data["tracking"]["field_control"]
+        load_scenario(DATA).changed(tracking={"event": event, "field_control": aimless})
+    load_scenario(DATA).changed(tracking={"event": event})
     with pytest.raises(ValueError, match=r"needs field control to act on; add a table \[tracking.field_control\]"):
-        type(load_scenario(DATA)).model_validate(data)
+        load_scenario(DATA).changed(tracking={"event": event, "field_control": None})
 
 
 @pytest.mark.parametrize("natural_hz", [0.0, 0.5, 2.2])

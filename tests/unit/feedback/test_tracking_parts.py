@@ -35,15 +35,7 @@ DATA = ROOT / "data" / "tracking_100m.toml"
 
 def changed(**tracking):
     """The shipped scenario with keys of [tracking] replaced."""
-    scenario = load_scenario(DATA)
-    data = scenario.model_dump(exclude_none=True)
-    for key, value in tracking.items():
-        if value is None:
-            data["tracking"].pop(key, None)
-            continue
-        old = data["tracking"].get(key)
-        data["tracking"][key] = {**old, **value} if isinstance(old, dict) else value
-    return type(scenario).model_validate(data)
+    return load_scenario(DATA).changed(tracking=tracking)
 
 
 # ---- margins ------------------------------------------------------------------------------------------------------

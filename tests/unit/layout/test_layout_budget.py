@@ -11,7 +11,7 @@ from rfpose.layout import maps
 from rfpose.layout.budget import SOURCES, error_budget, target_slope, working_point
 from rfpose.layout.budget.world import DrawnSites
 from rfpose.measurement import noise_of
-from rfpose.scenario import Scenario, load_scenario
+from rfpose.scenario import load_scenario
 from rfpose.simulator import Simulator
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -20,12 +20,8 @@ SUN = geometry.enu_from_azimuth_elevation(np.radians(170.0), np.radians(50.0))
 
 def site(n_heliostat=4, **tables):
     """Table 2 at 100 m with a few heliostats and other settings; `heliostat` settings go to each."""
-    data = load_scenario(ROOT / "data" / "table2_100m.toml").model_dump(exclude_none=True)
-    each = tables.pop("heliostat", {})
-    data["heliostat"] = [{**h, **each} for h in data["heliostat"][:n_heliostat]]
-    for name, values in tables.items():
-        data[name] = values if isinstance(values, list) else {**data.get(name, {}), **values}
-    return Scenario.model_validate(data)
+    shipped = load_scenario(ROOT / "data" / "table2_100m.toml")
+    return shipped.changed(heliostat=shipped.heliostat[:n_heliostat]).changed(**tables)
 
 
 def two_tones(**tables):
@@ -199,10 +195,9 @@ def test_what_cannot_be_budgeted_is_refused():
         plan_of(site(), pose="loose")
     with pytest.raises(InvalidInputError, match="knows no reflection"):
         plan_of(two_tones(**REFLECTING, budget={"ground": "known"}), pose="independent")
-    mixed = site().model_dump(exclude_none=True)
-    mixed["heliostat"][0]["pivot_sigma_m"] = 0.01
+    one, *more = site().heliostat
     with pytest.raises(GeometryError, match="pivot survey"):
-        plan_of(Scenario.model_validate(mixed))
+        plan_of(site().changed(heliostat=[one.changed(pivot_sigma_m=0.01), *more]))
 
 
 def test_a_larger_site_has_larger_lengths():

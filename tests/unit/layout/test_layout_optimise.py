@@ -241,7 +241,7 @@ def test_no_tower_is_placed_inside_a_building():
         for k, place in enumerate(wanted[:3])
     ]
     built = site.changed(transmitter=[
-        {**t.model_dump(exclude_none=True), "position_enu_m": (1.3 * t.position_enu_m[0], *t.position_enu_m[1:])}
+        t.changed(position_enu_m=(1.3 * t.position_enu_m[0], *t.position_enu_m[1:]))
         for t in site.transmitter
     ], site={"structures": {"box": boxes}})  # fmt: skip
     found = rf.optimise(built, starts=2, rules=Rules(radius_m=100.0, height_m=(20.0, 50.0))).scenario

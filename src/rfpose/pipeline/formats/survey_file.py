@@ -184,11 +184,10 @@ class SurveyFile:
                 )
             _near(f"receivers of heliostat `{h.id}`", places, h.receiver_mirror_m, h.receiver_survey_sigma_m)
             _near(f"pivot of heliostat `{h.id}`", self.pivot_enu_m[i], h.pivot_enu_m, h.pivot_sigma_m or 0.0)
-            data = h.model_dump(exclude_none=True)
-            data.update(receiver_mirror_m=places.tolist(), pivot_enu_m=self.pivot_enu_m[i].tolist())
+            surveyed = {"receiver_mirror_m": places, "pivot_enu_m": self.pivot_enu_m[i], "pivot_sigma_m": pivot_sigma}
             if delay_sigma > 0.0 and h.receiver_delay_sigma_s:
-                data["receiver_delay_sigma_s"] = delay_sigma
-            heliostats.append({**data, "pivot_sigma_m": pivot_sigma})
+                surveyed["receiver_delay_sigma_s"] = delay_sigma
+            heliostats.append(h.changed(**surveyed))
         of = {t.id: k for k, t in enumerate(self.scenario.transmitter)}
         transmitters = []
         for t in scenario.transmitter:
@@ -196,7 +195,7 @@ class SurveyFile:
                 raise ScenarioError(f"the survey is of another site: it has no transmitter `{t.id}`; survey this site")
             place = self.transmitter_enu_m[of[t.id]]
             _near(f"transmitter `{t.id}`", place, t.position_enu_m, t.survey_sigma_m)
-            transmitters.append({**t.model_dump(exclude_none=True), "position_enu_m": place.tolist()})
+            transmitters.append(t.changed(position_enu_m=place))
         return scenario.changed(heliostat=heliostats, transmitter=transmitters, **self._ground(scenario))
 
     def without_delays(self, tones: TonePhases, scenario: Scenario) -> TonePhases:
