@@ -3,8 +3,8 @@
     python benchmarks/walk.py
 
 Each function is read once, where it is first called, depth first. A step goes from a function into one of another file;
-return is a step into a file that was left already. Left out: kernels, how records check themselves, and what every part
-leans on (checks, errors, scenario, recording). The work on receivers, which threads share, is not followed.
+a return is a step into a file that was left already. Left out: kernels, how records check themselves, and what every
+part leans on (checks, errors, geometry, scenario, recording). What threads do for receivers is not followed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ LEANED_ON = (
     "errors.py",
     "files.py",
     "foreign.py",
+    "geometry.py",
     "interruption.py",
     "jit.py",
     "recording",
     "scenario",
     "shown.py",
 )
-FIRST_OF_POSE = "solve"
-"""The function that takes tone phases."""
 
 
 class Step(NamedTuple):
@@ -79,25 +78,52 @@ def walked(recording: rf.Recording) -> list[Step]:
     return steps
 
 
-def show(steps: list[Step]) -> None:
-    """Print each step, and how many of them are returns."""
-    files: list[str] = []
+def returns(steps: list[Step]) -> dict[str, list[str]]:
+    """Return by file the functions for which it is entered again."""
+    seen: set[str] = set()
+    again: dict[str, list[str]] = {}
     for step in steps:
-        mark = "<-" if step.file in files else "  "
-        print(f"{mark} {'  ' * step.depth}{step.file}: {step.function}")
-        if step.file not in files:
-            files.append(step.file)
-    print(f"{len(steps)} steps, {len(files)} files, {len(steps) - len(files)} returns")
+        if step.file in seen:
+            again.setdefault(step.file, []).append(step.function)
+        seen.add(step.file)
+    return again
+
+
+def from_phases(steps: list[Step]) -> list[Step]:
+    """Return the part from tone phases to normals."""
+    return steps[
+        next(k for k, step in enumerate(steps) if step.file == "pipeline/solve.py" and step.function == "solve") :
+    ]
+
+
+def small_recording() -> rf.Recording:
+    """Return two mirrors in two frames."""
+    site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    small = {"radio": {"frame_samples": 40_000}, "simulation": {"frame_count": 2}}
+    return rf.simulate(site.changed(heliostat=site.heliostat[:2], **small), seed=1)
+
+
+def summary(steps: list[Step]) -> str:
+    """Return how many steps, files and returns there are."""
+    again = sum(map(len, returns(steps).values()))
+    return f"{len(steps)} steps, {len({step.file for step in steps})} files, {again} returns"
 
 
 def main() -> None:
     """Process a small recording twice, the second time watched."""
-    site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
-    small = {"radio": {"frame_samples": 40_000}, "simulation": {"frame_count": 2}}
-    recording = rf.simulate(site.changed(heliostat=site.heliostat[:2], **small), seed=1)
+    recording = small_recording()
     rf.process(recording)
     steps = walked(recording)
-    show(steps)
+    seen: set[str] = set()
+    for step in steps:
+        print(f"{'<-' if step.file in seen else '  '} {'  ' * step.depth}{step.file}: {step.function}")
+        seen.add(step.file)
+    part = from_phases(steps)
+    print(
+        f"\nfrom recording to normals: {summary(steps)}\nfrom tone phases to normals: {summary(part)}; entered again:"
+    )
+    for file, functions in returns(part).items():
+        print(f"  {file}: {', '.join(functions)}")
 
 
 if __name__ == "__main__":
