@@ -132,7 +132,7 @@ def _fuzz(name: str, seconds: float) -> None:
     for seed in [bytes(range(64))] if changed else seeds:
         (corpus / hashlib.sha1(seed, usedforsecurity=False).hexdigest()).write_bytes(seed)
     words = work / "words"
-    words.write_text("" if changed else _dictionary(seeds))
+    words.write_text(_dictionary([] if changed else seeds))
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     options = {
         "max_total_time": int(seconds), "max_len": 128 if changed else max(max(map(len, seeds)) * 5 // 4, 64),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import tarfile
+import zipfile
 from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
@@ -123,9 +124,17 @@ def gnuradio_headers() -> Iterable[bytes]:
     yield _pmt(head | {"strt": 149, "bytes": 4096}) + b"\6"
 
 
-def _archive(members: dict[str, bytes]) -> bytes:
+def _zip(members: dict[str, bytes]) -> bytes:
     out = BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as archive:
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+def _archive(members: dict[str, bytes], packing: str = "") -> bytes:
+    out = BytesIO()
+    with tarfile.open(fileobj=out, mode=f"w:{packing}", format=tarfile.USTAR_FORMAT) as archive:
         for name, content in members.items():
             info = tarfile.TarInfo(name)
             info.size = len(content)
@@ -181,6 +190,7 @@ def make(folder: Path) -> dict[str, list[bytes]]:
     found |= _antennas(folder)
     found |= _paint(folder)
     metas = [json.dumps(meta).encode() for meta in _metas()]
+    pair = {"a.sigmf-meta": metas[0], "a.sigmf-data": SAMPLES[:64]}
     found |= {
         "scenario": [(folder / f"{name}.toml").read_bytes() for name in ("site", "day")]
         + [path.read_bytes() for path in DATA.glob("*.toml") if path.stat().st_size < 20_000]
@@ -202,7 +212,8 @@ def make(folder: Path) -> dict[str, list[bytes]]:
         "gnuradio": list(gnuradio_headers()),
         "sigmf": metas,
         "sigmf-archive": [
-            _archive({"a.sigmf-meta": metas[0], "a.sigmf-data": SAMPLES[:64]}),
+            *(_archive(pair, packing) for packing in ("gz", "xz", "")),
+            _zip(pair),
             _archive({"x/b.sigmf-meta": metas[2], "x/b.sigmf-data": SAMPLES[:64], "x/b.sigmf-collection": b"{}"}),
         ],
         "sigmf-collection": [

@@ -76,6 +76,11 @@ def _sigmf(field: Field) -> Callable[[bytes], None]:
     return lambda data: _read_all(field.file("a.sigmf-meta", data))
 
 
+def _packing(data: bytes) -> str:
+    """Return the ending of an archive that begins so."""
+    return {b"\x1f\x8b": ".gz", b"\xfd7": ".xz", b"PK": ".zip"}.get(data[:2], "")
+
+
 def _collection(field: Field) -> Callable[[bytes], None]:
     field.file("a.sigmf-data", SAMPLES)
     field.file(
@@ -303,7 +308,7 @@ def targets() -> Mapping[str, Callable[[Field], Callable[[bytes], None]]]:
     """Return how each target is set up, by name; what that returns is called with bytes."""
     return {
         "native": lambda field: lambda data: _read_all(field.file("a.h5", data)),
-        "sigmf-archive": lambda field: lambda data: _read_all(field.file("a.sigmf", data)),
+        "sigmf-archive": lambda field: lambda data: _read_all(field.file(f"a.sigmf{_packing(data)}", data)),
         "result": _of("r.h5", "pipeline.formats.result_file", "open_result"),
         "track": _of("t.h5", "pipeline.formats.track_file", "open_track"),
         "survey": _of("s.h5", "pipeline.formats.survey_file", "read_survey"),
@@ -410,7 +415,7 @@ def _edit_dataset(file: h5py.File, name: str, choose: Any) -> None:
     if how == 3:
         kind = choose.PickValueInList(["<i1", ">i4", "<u8", "<f4", ">f8", "<c8"])
         del file[name]
-        file[name] = values.astype(kind)
+        file[name] = (values if kind == "<c8" else np.real(values)).astype(kind)
         return
     flat = np.array(values).reshape(-1)
     at = choose.ConsumeIntInRange(0, max(flat.size - 1, 0))
