@@ -24,7 +24,7 @@ from rfpose.pipeline.samples.paint import write_paint
 from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.survey import survey
 from rfpose.pipeline.track import track
-from rfpose.recording import convert, open_recording
+from rfpose.recording import RecordingWriter, convert, open_recording
 from rfpose.scenario import Scenario, check_scenario, load_scenario
 
 __all__ = ["make"]
@@ -186,6 +186,7 @@ def make(folder: Path) -> dict[str, list[bytes]]:
     }
     survey([folder / "a.h5"], folder / "survey.h5", force=True)
     found["survey"] = [(folder / "survey.h5").read_bytes()]
+    found["native"].insert(0, _short(folder, site))
     found |= _digital_rf(folder)
     found |= _antennas(folder)
     found |= _paint(folder)
@@ -248,6 +249,23 @@ def make(folder: Path) -> dict[str, list[bytes]]:
     }
     (folder / "seeds.done").touch()
     return found
+
+
+def _short(folder: Path, site: Scenario) -> bytes:
+    """Return a recording of few samples, most of whose bytes say what they are."""
+    settings: dict[str, Any] = {
+        "sample_rate": site.radio.sample_rate,
+        "centre_frequency_hz": 1e8,
+        "provenance": {"a": "b"},
+    }
+    names, samples = ["H01_r0", "H01_r1"], np.frombuffer(SAMPLES[:400], np.int16).reshape(-1, 2)
+    with RecordingWriter(
+        folder / "short.h5", scenario=site, receiver_ids=names, sample_format="int16", full_scale=32767, **settings
+    ) as writer:
+        for k, name in enumerate(names):
+            writer.write(name, 1_790_000_000 * 10**6, samples)
+            writer.write(name, 1_790_000_001 * 10**6 + k, samples)
+    return (folder / "short.h5").read_bytes()
 
 
 def _digital_rf(folder: Path) -> dict[str, list[bytes]]:

@@ -349,9 +349,11 @@ _INTEGERS = (-1, 0, 1, 2, 127, 255, -(2**62), 2**62, 2**63 - 1, -(2**63))
 def edited(sound: bytes, choose: Any) -> bytes:
     """Return an HDF5 file with one to three values changed, as ``choose`` (atheris' FuzzedDataProvider) says."""
     image = BytesIO(sound)
-    with h5py.File(image, "r+") as file:
+    with h5py.File(image, "r+") as file, np.errstate(all="ignore"):
         for _ in range(choose.ConsumeIntInRange(1, 3)):
             places = _places(file)
+            if not places:
+                break
             name, key = places[choose.ConsumeIntInRange(0, len(places) - 1)]
             with contextlib.suppress(ValueError, TypeError, OverflowError, OSError, KeyError, UnicodeEncodeError):
                 if key is not None:

@@ -33,7 +33,7 @@ def test_what_a_library_quotes_of_a_damaged_archive_is_cut(tmp_path):
     at = content.rindex(b"x" * 5000)  # in the directory, whose names must be those before the members
     path.write_bytes(content[:at] + b"a.npy" + b"y" * 4995 + content[at + 5000 :])
     name = "a.npy" + "y" * 4995
-    with pytest.raises(RecordingError, match="rays.npz: no sound archive") as caught:
+    with pytest.raises(RecordingError, match=r"rays\.npz: no sound archive") as caught:
         read_arrays(path, [name.removesuffix(".npy")])
     assert len(str(caught.value)) < 500 + len(name)
 
