@@ -47,6 +47,8 @@ ARRAY_BYTES: Final = 2**29
 """Arrays of one file that take more memory than this are refused unless their reader allows more."""
 
 _DEPTH: Final = 64
+_SAID: Final = 200
+"""Characters of what a library says; some quote the whole of what they could not read."""
 _DIGITS: Final = 100
 _EXPONENT: Final = 100
 _LARGEST_DENOMINATOR: Final = 1_000_000
@@ -262,7 +264,7 @@ def _parsed(
     try:
         return parse(text)
     except (ValueError, RecursionError) as failure:  # Python's own limit on digits is a ValueError as well
-        raise error(f"{source}: not valid {language}: {failure}; {remedy}") from failure
+        raise error(f"{source}: not valid {language}: {failure!s:.{_SAID}}; {remedy}") from failure
 
 
 def _refuse_depth(text: str, token: re.Pattern[str], source: str, error: type[RfposeError], remedy: str) -> str:
@@ -344,7 +346,7 @@ def read_arrays(
         raise error(f"{path}: cannot be read: {failure.strerror or failure}; {remedy}") from failure
     # what a damaged archive raises differs by where the damage is
     except (ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as failure:
-        raise error(f"{path}: no sound archive of arrays (numpy's npz): {failure}; {remedy}") from failure
+        raise error(f"{path}: no sound archive of arrays (numpy's npz): {failure!s:.{_SAID}}; {remedy}") from failure
     return found
 
 

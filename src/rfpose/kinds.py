@@ -7,7 +7,16 @@ from pathlib import Path
 
 from rfpose.errors import RecordingError
 
-__all__ = ["FORMAT_KINDS", "check_kind", "head_of", "is_hdf5", "kind_of", "told_kind"]
+__all__ = [
+    "COMPRESSED_SIGMF",
+    "FORMAT_KINDS",
+    "SIGMF_ENDINGS",
+    "check_kind",
+    "head_of",
+    "is_hdf5",
+    "kind_of",
+    "told_kind",
+]
 
 FORMAT_KINDS = {
     "rfpose-iq": "recording",
@@ -36,6 +45,9 @@ _MADE = {
     "antenna": ("antenna pattern", "`scripts/antenna_pattern.py`"),
     "survey": ("survey", "`rfpose survey`"),
 }
+COMPRESSED_SIGMF = (".sigmf.gz", ".sigmf.xz", ".sigmf.zip")
+"""Endings of SigMF's archives that are compressed."""
+SIGMF_ENDINGS = (".sigmf", ".sigmf-meta", ".sigmf-data", ".sigmf-collection", *COMPRESSED_SIGMF)
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
@@ -57,7 +69,7 @@ def kind_of(path: str | Path) -> str | None:
     By what a file says of itself at its beginning; whether it is sound is for its reader to say.
     """
     path = Path(path)
-    if path.suffix in (".sigmf", ".sigmf-meta", ".sigmf-data", ".sigmf-collection"):
+    if path.name.endswith(SIGMF_ENDINGS):
         return "recording"
     head = head_of(path, _HEAD_BYTES)
     if not head:

@@ -18,7 +18,8 @@ from rfpose.feedback.correlated import AXES_AND_ZEROS
 from rfpose.feedback.mount import Mount, command, posture
 from rfpose.multilat.site import lever_to_turn
 from rfpose.pipeline.formats.survey_file import read_survey
-from rfpose.recording import frame_starts
+from rfpose.pipeline.site.frames import frames_of, inputs_of, listed
+from rfpose.recording import RecordingWriter, frame_starts
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,35 @@ def surveyed(site, recording, reference, tmp_path_factory):
     path = tmp_path_factory.mktemp("found") / "survey.h5"
     rf.survey([recording], path, scenario=site, reference=reference)
     return path
+
+
+def test_parts_are_one_recording(site, recording, tmp_path):
+    """Receivers in files of their own; each file alone would know nothing of how transmitters' phases drift."""
+    folder = tmp_path / "night"
+    folder.mkdir()
+    names = np.array_split(np.array(recording.receiver_ids), 2)
+    settings = {
+        key: getattr(recording, key) for key in ("sample_rate", "centre_frequency_hz", "sample_format", "full_scale")
+    }
+    for k, part in enumerate(names):
+        path = folder / f"{k}.h5"
+        with RecordingWriter(path, scenario=site, receiver_ids=part.tolist(), provenance={}, **settings) as writer:
+            for name in part.tolist():
+                for start, count in recording.blocks(name).tolist():
+                    writer.write(name, start, recording.read(name, start, count))
+    parts = sorted(folder.iterdir())
+    for given in (parts, [folder], [parts]):
+        many = listed(given)
+        assert len(many) == 1
+        assert set(inputs_of(many)) >= set(parts)
+    (wanted,), _ = frames_of([recording], site, follow_links=False)
+    (found,), _ = frames_of(listed(parts), site, follow_links=False)
+    assert np.isfinite(found.carrier).all()
+    assert found.carrier.tobytes() == wanted.carrier.tobytes()
+    assert found.unix_s.tobytes() == wanted.unix_s.tobytes()
+    # nights of the same receivers stand by themselves
+    recording.save(tmp_path / "whole.h5")
+    assert listed([tmp_path / "whole.h5"] * 2) == [tmp_path / "whole.h5"] * 2
 
 
 def rms_mrad(result):

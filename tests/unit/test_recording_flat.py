@@ -19,14 +19,24 @@ def values(n, n_receiver=1, seed=0):
     return np.random.default_rng(seed).integers(-100, 100, size=(n, n_receiver, 2))
 
 
+def stored_as(x, name):
+    """Return the bytes of numbers as a sample type, without rfpose."""
+    kind = sample_type(name)
+    if not name.startswith("ci24"):
+        return (x + kind.zero).astype(kind.component).tobytes()
+    order = "big" if name.endswith("be") else "little"
+    return b"".join(int(value).to_bytes(3, order, signed=True) for value in x.ravel())
+
+
 # -- raw -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SAMPLE_TYPES)
 def test_raw_samples_of_every_type(tmp_path, name):
-    kind = sample_type(name)
     x = values(500, 2)
-    (tmp_path / "x.iq").write_bytes((x + kind.zero).astype(kind.component).tobytes())
+    if "24" in name:  # all of the bits, which floats hold exactly
+        x[:4, 0] = [[2**23 - 1, -(2**23)], [-1, 1], [256, -256], [65536, -65537]]
+    (tmp_path / "x.iq").write_bytes(stored_as(x, name))
     declared = Declared(
         sample_type=name, sample_rate=Fraction(10**6, 3), start_s=Fraction(START_S) + Fraction(1, 4),
         centre_frequency_hz=1e8, receiver_ids=("a", "b"),
@@ -37,6 +47,7 @@ def test_raw_samples_of_every_type(tmp_path, name):
         assert r.sample_rate == Fraction(10**6, 3)
         for k, receiver in enumerate("ab"):
             assert r.blocks(receiver).tolist() == [[first, 500]]
+            assert np.array_equal(r.read(receiver, first, 407), x[:407, k])
             assert np.array_equal(r.read(receiver, first + 7, 400), x[7:407, k])
 
 
@@ -105,21 +116,22 @@ def wav(*chunks, magic=b"RIFF", size=None):
 
 
 @pytest.mark.parametrize(
-    ("code", "bits", "dtype", "zero"), [(1, 8, "u1", 128), (1, 16, "<i2", 0), (1, 32, "<i4", 0), (3, 32, "<f4", 0)]
+    ("code", "bits", "name"),
+    [(1, 8, "cu8"), (1, 16, "ci16_le"), (1, 24, "ci24_le"), (1, 32, "ci32_le"), (3, 32, "cf32_le")],
 )
 @pytest.mark.parametrize("n_receiver", [1, 2])
-def test_wav_of_every_type_with_auxi(tmp_path, code, bits, dtype, zero, n_receiver):
+def test_wav_of_every_type_with_auxi(tmp_path, code, bits, name, n_receiver):
     x = values(1001, n_receiver)
-    stored = (x + zero).astype(dtype)
     path = tmp_path / "HDSDR.wav"
-    path.write_bytes(wav(fmt(2 * n_receiver, bits=bits, code=code), auxi(), chunk(b"data", stored.tobytes())))
+    path.write_bytes(wav(fmt(2 * n_receiver, bits=bits, code=code), auxi(), chunk(b"data", stored_as(x, name))))
     first = START_S * RATE + RATE // 4
     with open_recording(path) as r:
         assert (r.format, r.centre_frequency_hz, r.sample_rate) == ("wav", 1e8, RATE)
         assert r.receiver_ids == (("HDSDR",) if n_receiver == 1 else ("HDSDR_r0", "HDSDR_r1"))
-        for k, name in enumerate(r.receiver_ids):
-            assert r.blocks(name).tolist() == [[first, 1001]]
-            assert np.array_equal(r.read(name, first, 1001), x[:, k])
+        for k, receiver in enumerate(r.receiver_ids):
+            assert r.blocks(receiver).tolist() == [[first, 1001]]
+            assert np.array_equal(r.read(receiver, first, 1001), x[:, k])
+        assert r.full_scale == (np.inf if code == 3 else 2 ** (bits - 1) - 1)
         assert not r.doubts
 
 
@@ -172,7 +184,7 @@ def test_wav_above_four_gigabytes(tmp_path, way):
     [
         (wav(), "no chunk `fmt `"),
         (wav(fmt(1), chunk(b"data", bytes(8))), "has 1 channel; IQ needs two"),
-        (wav(fmt(bits=24), chunk(b"data", bytes(12))), "samples of 24 bits"),
+        (wav(fmt(bits=20), chunk(b"data", bytes(12))), "samples of 20 bits"),
         (wav(fmt()), "no chunk `data`"),
         (wav(fmt(), b"auxi" + struct.pack("<I", 5000) + bytes(20)), "chunk b'auxi' at byte 36 says that it has 5000"),
         (wav(fmt(), magic=b"RF64"), "RF64 without its chunk `ds64`"),
@@ -312,6 +324,38 @@ def test_gnuradio_with_detached_header(tmp_path):
     with open_recording(tmp_path) as r:
         assert r.receiver_ids == ("mirror1",)
         assert "its header counts 1000 samples, its file holds 900" in r.doubts["mirror1"][0]
+
+
+FROM_GNURADIO = bytes.fromhex(
+    "0907020004737472740b00000000000000ab090702000562797465730b0000000000002ee0090702000772785f7261746504412e848000000000"
+    "090702000772785f74696d650c000000020b000000006ab13b80043fd0000000000000090702000463706c780009070200047479706503000000"
+    "01090702000473697a650300000004090702000776657273696f6e030000000006090702000772785f66726571044197d7840000000006"
+    "0907020004737472740b00000000000000bd090702000562797465730b0000000000001f40090702000772785f7261746504412e848000000000"
+    "090702000772785f74696d650c000000020b000000006ab13b80043fd0000000000000090702000463706c780009070200047479706503000000"
+    "01090702000473697a650300000004090702000776657273696f6e03000000000609070200046761696e04403e00000000000009070200077278"
+    "5f66726571044197d7840000000006"
+)
+"""What File Meta Sink of GNU Radio 3.10.5.1 wrote of 5000 complex shorts: time, rate and tuning at 0, gain at 3000."""
+
+
+def test_gnuradios_own_headers(tmp_path):
+    x = values(5000).astype("<i2")
+    first = 1_790_000_000_250_000
+    (tmp_path / "m.iq").write_bytes(x.tobytes())
+    (tmp_path / "m.iq.hdr").write_bytes(FROM_GNURADIO)
+    with open_recording(tmp_path / "m.iq") as r:
+        assert (r.sample_rate, r.centre_frequency_hz) == (10**6, 1e8)
+        assert r.blocks("m").tolist() == [[first, 5000]]  # the second header repeats the first one's time
+        assert np.array_equal(r.read("m", first, 5000), x[:, 0])
+        assert not r.doubts
+    # with segments of at most 700, a gap before 3000 and a gain at 4000, whose header is a segment late
+    lasts = [700, 700, 700, 700, 200, 700, 300, 700, 300]
+    said = [0.25, 0.2507, 0.2514, 0.2521, 0.2528, 0.26, 0.2607, 0.2607, 0.2614]
+    headers = [gnuradio_header(4 * n, 1_790_000_000, at, size=4, type=1) for n, at in zip(lasts, said, strict=True)]
+    (tmp_path / "m.iq.hdr").write_bytes(b"".join(headers))
+    with open_recording(tmp_path / "m.iq") as r:
+        assert r.blocks("m").tolist() == [[first, 3000], [first + 10_000, 2000]]
+        assert not r.doubts
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import json
 import math
 import subprocess
 import sys
+import tempfile
 import warnings
 from fractions import Fraction
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.recording import GapError, Recording, RecordingWriter, convert, count_fill, describe, open_recording
+from rfpose.recording.hdf5 import FROM_SAMPLES
 from rfpose.scenario import load_scenario
 
 drf = pytest.importorskip("digital_rf", reason="the digital_rf library is not installed")
@@ -416,13 +418,10 @@ def test_sigmf_archive_and_collection_of_the_library(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sigmf.SigMFCollection(["r0.sigmf-meta", "r1.sigmf-meta"]).tofile("both")
     sigmf.fromfile("r0.sigmf-meta").archive("packed")
-    sigmf.fromfile("r0.sigmf-meta").archive("packed.sigmf.gz", compression="gz")
     with open_recording(tmp_path / "packed.sigmf") as r:
         assert r.receiver_ids == ("r0",) or r.receiver_ids == ("packed",)
         assert np.array_equal(r.read(r.receiver_ids[0], EPOCH + 5, 900), x["r0"][5:905])
         assert tmp_path / "packed.sigmf" in r.files()
-    with pytest.raises(RecordingError, match="compressed SigMF archive; unpack it"):
-        open_recording(tmp_path / "packed.sigmf.gz")
     with open_recording(tmp_path / "both.sigmf-collection") as r:
         assert r.receiver_ids == ("r0", "r1")
         assert np.array_equal(r.read("r1", EPOCH, 1000), x["r1"])
@@ -436,10 +435,42 @@ def test_sigmf_archive_and_collection_of_the_library(tmp_path, monkeypatch):
         assert "names `r1.sigmf-meta`, which is missing" in r.notes[1]
 
 
-def test_sigmf_archive_that_is_none(tmp_path):
-    (tmp_path / "a.sigmf").write_bytes(b"x")
-    with pytest.raises(RecordingError, match="no sound uncompressed archive"):
-        open_recording(tmp_path / "a.sigmf")
+@pytest.mark.parametrize("packed", ["gz", "xz", "zip"])
+def test_compressed_sigmf_archives_of_the_library(tmp_path, monkeypatch, packed):
+    x = counts(1000, 3)
+    write_sigmf(tmp_path, "r0", x, [{"core:sample_start": 0, "core:global_index": EPOCH}])
+    monkeypatch.chdir(tmp_path)
+    sigmf.fromfile("r0.sigmf-meta").archive(f"packed.sigmf.{packed}", compression=packed)
+    path, room = tmp_path / f"packed.sigmf.{packed}", tmp_path / "room"
+    room.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(room))
+    with open_recording(path) as r:
+        (name,) = r.receiver_ids
+        assert np.array_equal(r.read(name, EPOCH + 5, 900), x[5:905])
+        assert set(r.files()) == {path}
+        assert sum(file.stat().st_size for file in room.rglob("*") if file.is_file()) == x.nbytes
+    assert not list(room.iterdir())
+    (tmp_path / "set").mkdir()
+    path.rename(tmp_path / "set" / path.name)
+    with open_recording(tmp_path / "set") as r:
+        assert r.receiver_ids == (name,)
+    path = tmp_path / "set" / path.name
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(RecordingError, match=rf"packed.sigmf.{packed}: .*archive"):
+        open_recording(path)
+    monkeypatch.setattr("rfpose.recording.sigmf_files._UNPACKED_BYTES", 3999 - FROM_SAMPLES * len(content))
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="would unpack to more than 1100 times its size"):
+        open_recording(path)
+    assert not list(room.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.sigmf", "a.sigmf.gz", "a.sigmf.xz", "a.sigmf.zip"])
+def test_sigmf_archive_that_is_none(tmp_path, name):
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(RecordingError, match=rf"{name}: (no sound (un)?compressed archive|cannot read)"):
+        open_recording(tmp_path / name)
 
 
 # -- conversion ----------------------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ def command() -> None:
     name="learn",
     epilog=examples(
         "rfpose antenna learn night.h5 day.h5 -o pattern.h5",
+        "rfpose antenna learn night/ -o pattern.h5",
         "rfpose antenna learn night.h5 --survey survey.h5 --start nec.h5 -o pattern.h5",
         'then in the scenario: [antenna] pattern = "pattern.h5"',
     ),
@@ -64,6 +65,9 @@ def learn(
     force: bool,
 ) -> None:
     """Learn the pattern of the receivers on a type of mirror from recordings of many postures.
+
+    A RECORDING may be a directory or a manifest (recording.toml) of parts, as for process. Recordings that do not all
+    hold the same receivers are parts of one.
 
     Mirrors must be alike, and stand where [posture] or the survey says to a few milliradians. Writes nothing where what
     was learned has not settled.

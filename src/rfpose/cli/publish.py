@@ -161,7 +161,9 @@ def _serve(result: Path, to: PlantServer) -> None:
 def _password(file: Path | None) -> str:
     """Return it from a file or the environment; on a command line others would see it."""
     if file is not None:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        from rfpose.foreign import read_text
+
+        lines = read_text(file, limit=2**16).splitlines()
         password = lines[0] if lines else ""
     else:
         password = os.environ.get(PASSWORD_VARIABLE, "")

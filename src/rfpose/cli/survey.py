@@ -30,6 +30,7 @@ __all__ = ["command"]
     name="survey",
     epilog=examples(
         "rfpose survey night.h5 day.h5 -o survey.h5",
+        "rfpose survey night/ -o survey.h5",
         "rfpose survey night.h5 --reference camera.csv -o survey.h5",
         "rfpose process recording.h5 --pose site --survey survey.h5 -o result.h5",
     ),
@@ -75,6 +76,9 @@ def command(
     force: bool,
 ) -> None:
     """Find what does not change over many postures: places of receivers, pivots, transmitters, mounts.
+
+    A RECORDING may be a directory or a manifest (recording.toml) of parts, as for process. Recordings that do not all
+    hold the same receivers are parts of one.
 
     Says what the postures do not tell: how the receivers are turned against the plate, above all, which radio alone
     never tells.

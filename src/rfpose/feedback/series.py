@@ -24,6 +24,8 @@ _LONGEST_BYTES = 2**28
 
 
 _MOST_SAMPLES = 2**28
+_MANY_SAMPLES, _LEAST_TOLD = 2**22, 0.01
+"""So many samples are made only if the file tells of so much of their time: two lines shall not ask for gigabytes."""
 _LAST_UNIX_S = 253_402_300_799.0
 
 
@@ -92,6 +94,13 @@ def read_series_csv(
         raise InvalidInputError(
             f"{path}: spans {(at[-1] - at[0]) / 86400.0:.0f} days, {n} samples of {interval_s:g} s, more than fit into "
             "memory; check its times, or give a part of it"
+        )
+    step = np.diff(at)
+    told_s = float(step[step <= longest_gap_s].sum())
+    if n > _MANY_SAMPLES and told_s < _LEAST_TOLD * (at[-1] - at[0]):
+        raise InvalidInputError(
+            f"{path}: spans {(at[-1] - at[0]) / 86400.0:.0f} days and tells of {told_s / 86400.0:.3g} of them, as most "
+            f"of its samples lie more than {longest_gap_s:g} s apart; check its times, or give a part of it"
         )
     grid = at[0] + interval_s * np.arange(n)
     even = np.interp(grid, at, values)

@@ -11,6 +11,7 @@ from rfpose.errors import GeometryError, RecordingError, ScenarioError
 from rfpose.kinds import kind_of
 from rfpose.recording import Declared, RecordingSource, describe, open_recording
 from rfpose.scenario import Scenario, load_scenario
+from rfpose.shown import plain
 
 # each kind loads its reader when one of it is there: a reader of results or runs takes longer to load than to read
 
@@ -33,7 +34,7 @@ def inspect_file(
     -------
     dict
         ``kind`` is ``"recording"``, ``"result"``, ``"track"`` (a tracking run), ``"scenario"``, ``"model"`` (mounts) or
-        ``"antenna"`` (a pattern); ``sound`` tells whether ``problems`` is empty.
+        ``"antenna"`` (a pattern); ``sound`` tells whether ``problems`` is empty. What is not known is None.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def inspect_file(
     kind = kind_of(path)
     readers = {"antenna": _antenna, "model": _models, "result": _result, "survey": _survey, "track": _track}
     if kind in readers:
-        return {"kind": kind, "path": str(path), **readers[kind](path)}
+        return {"kind": kind, "path": str(path), **plain(readers[kind](path))}
     if kind == "truth":
         raise RecordingError(f"{path}: a truth, which `rfpose evaluate` takes; give it there beside its result")
     if kind == "scenario" or (kind is None and path.suffix == ".toml"):

@@ -21,11 +21,10 @@ from rfpose.pipeline.formats.mount_file import MountFile, read_models
 from rfpose.pipeline.formats.survey_file import SurveyFile, read_survey
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, listed
+from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, inputs_of, listed
 from rfpose.pipeline.site.mounts import normals_by_mounts, planned_mounts
 from rfpose.pipeline.site.poses import rotations
 from rfpose.propagation import RayKind
-from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
 __all__ = ["learn_from_frames", "learn_pattern"]
@@ -59,7 +58,7 @@ def learn_pattern(
     Parameters
     ----------
     recordings
-        Of one site, whose mirrors are alike.
+        Of one site, whose mirrors are alike; several, or parts of one, as for `rfpose.survey`.
     output
         File to write, format ``rfpose-antenna``, for ``[antenna] pattern``.
     scenario
@@ -84,10 +83,9 @@ def learn_pattern(
     InvalidInputError
         No recording, too few postures, or what was learned did not come to rest: nothing is written.
     """
-    many = listed(recordings)
-    read = [r for r in many if not isinstance(r, Recording)]
+    many = listed(recordings, follow_links=follow_links)
     files = [f for f in (scenario, start, survey, mounts) if isinstance(f, str | Path)]
-    with claim(output, inputs=[*read, *files], force=force):
+    with claim(output, inputs=[*inputs_of(many), *files], force=force):
         parts, site = frames_of(many, scenario, follow_links=follow_links)
         surveyed = read_survey(survey) if isinstance(survey, str | Path) else survey
         given = read_models(mounts) if isinstance(mounts, str | Path) else mounts

@@ -28,10 +28,9 @@ from rfpose.pipeline.formats.survey_file import SurveyedMounts, SurveyFile, writ
 from rfpose.pipeline.mirrors import MirrorGroup, mirror_groups
 from rfpose.pipeline.postures import read_postures
 from rfpose.pipeline.site.field import SiteField, antenna_of
-from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, listed
+from rfpose.pipeline.site.frames import Frames, Recordings, commanded_in, frames_of, inputs_of, listed
 from rfpose.pipeline.site.mounts import commanded_counts, planned_mounts, surveyed_mounts
 from rfpose.pipeline.site.poses import knowledge_of, rotations, settings_of, wavenumbers_of
-from rfpose.recording import Recording
 from rfpose.scenario import Scenario
 
 __all__ = ["Frames", "SurveyKnowledge", "survey", "survey_frames"]
@@ -55,7 +54,8 @@ def survey(
     Parameters
     ----------
     recordings
-        Of one site.
+        Of one site. Paths that hold the same receivers are recordings by themselves; where some hold others, all are
+        parts of one, as are those of a directory or a manifest, and of a list within the list.
     output
         File to write, format ``rfpose-survey``.
     scenario
@@ -100,14 +100,13 @@ def survey(
     >>> found.undetermined[0][0]
     'rotation of the receivers against the plate about x'
     """
-    many = listed(recordings)
+    many = listed(recordings, follow_links=follow_links)
     if not reference_sigma_rad > 0.0:
         raise InvalidInputError(f"`reference_sigma_rad` must be greater than zero, got {reference_sigma_rad}")
     if motors is not None and mounts is None:
         raise InvalidInputError("`motors` are counted as the mounts' drives have it: give `mounts=FILE` with them")
-    read = [r for r in many if not isinstance(r, Recording)]
     files = [f for f in (scenario, reference, mounts, motors) if isinstance(f, str | Path)]
-    with claim(output, inputs=[*read, *files], force=force):
+    with claim(output, inputs=[*inputs_of(many), *files], force=force):
         parts, site = frames_of(many, scenario, follow_links=follow_links)
         besides = SurveyKnowledge.read(site, parts, reference, reference_sigma_rad, mounts, motors)
         found = survey_frames(parts, site, besides, on_progress=on_progress)

@@ -18,10 +18,13 @@ from rfpose.scenario import Scenario
 
 __all__ = ["SAMPLE_TYPES", "FlatRecording", "FlatStream", "SampleType", "sample_type"]
 
-SAMPLE_TYPES: Final = ("ci8", "cu8", "ci16_le", "ci16_be", "ci32_le", "ci32_be", "cf32_le", "cf32_be")
-"""As SigMF names them: complex, signed or unsigned integers or floats, their bits, little or big endian."""
+SAMPLE_TYPES: Final = (
+    "ci8", "cu8", "ci16_le", "ci16_be", "ci24_le", "ci24_be", "ci32_le", "ci32_be", "cf32_le", "cf32_be",
+)  # fmt: skip
+"""As SigMF names them: complex, signed or unsigned integers or floats, their bits, little or big endian. SigMF itself
+has none of 24 bits, which sound cards and WAV have."""
 
-_TYPE: Final = re.compile(r"c(i|u|f)(8|16|32)(?:_(le|be))?")
+_TYPE: Final = re.compile(r"c(i|u|f)(8|16|24|32)(?:_(le|be))?")
 _CONVERTED_SAMPLES: Final = 2**18
 """Samples of another type than the recording's are converted in pieces of so many."""
 
@@ -35,10 +38,12 @@ class SampleType:
     name
         As SigMF names it.
     component
-        I or Q as stored.
+        I or Q as stored; bytes without a meaning (``V3``) where numpy has no such type, see `numbers`.
+    big_endian
+        Whether the first byte counts most.
     sample_format
-        What `Recording.read` gives. Integers of 8 and 16 bits become int16 exactly, floats stay, integers of 32 bits
-        become float32, which has 24 bits.
+        What `Recording.read` gives. Integers of 8 and 16 bits become int16 exactly, floats stay, integers of 24 and 32
+        bits become float32, which has 24 bits.
     zero
         Stored value that means zero.
     full_scale
@@ -47,6 +52,7 @@ class SampleType:
 
     name: str
     component: np.dtype[Any]
+    big_endian: bool = False
     sample_format: SampleFormat
     zero: int = 0
     full_scale: float
@@ -55,6 +61,18 @@ class SampleType:
     def sample_bytes(self) -> int:
         """Bytes of one I and one Q."""
         return 2 * self.component.itemsize
+
+    def numbers(self, stored: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Return stored components as numbers of a type that numpy has."""
+        if self.component.kind != "V":
+            return stored
+        # as the upper three of four bytes, shifted down with their sign
+        wide = np.zeros((*stored.shape, 4), np.uint8)
+        inner = slice(0, 3) if self.big_endian else slice(1, 4)
+        wide[..., inner] = np.ascontiguousarray(stored).view(np.uint8).reshape(*stored.shape, 3)
+        shifted = wide.view(">i4" if self.big_endian else "<i4")[..., 0]
+        numbers: np.ndarray[Any, Any] = np.right_shift(shifted, 8)
+        return numbers
 
 
 def sample_type(name: str) -> SampleType:
@@ -69,13 +87,15 @@ def sample_type(name: str) -> SampleType:
     kind, bits, order = match.groups() if match else ("", "", None)
     if match is None or (kind == "u" and bits != "8") or (kind == "f" and bits != "32"):
         raise InvalidInputError(f"`sample_type` must be one of {', '.join(SAMPLE_TYPES)}, got {name!r:.40}")
-    component = np.dtype(f"{'>' if order == 'be' else '<'}{kind}{int(bits) // 8}")
+    big_endian = order == "be"
+    component = np.dtype("V3" if bits == "24" else f"{'>' if big_endian else '<'}{kind}{int(bits) // 8}")
     if kind == "f":
         return SampleType(name=name, component=component, sample_format="complex64", full_scale=math.inf)
     return SampleType(
         name=name,
         component=component,
-        sample_format="complex64" if bits == "32" else "int16",
+        big_endian=big_endian,
+        sample_format="complex64" if bits in ("24", "32") else "int16",
         zero=128 if kind == "u" else 0,
         full_scale=float(2 ** (int(bits) - 1) - 1),
     )
@@ -177,7 +197,7 @@ class FlatRecording(Recording):
             part = out[at : at + _CONVERTED_SAMPLES]
             stored = np.empty((len(part), stream.channels, 2), stream.type.component)
             self._fill(stream.file, place + at * width, stored)
-            values = stored[:, stream.channel]
+            values = stream.type.numbers(stored[:, stream.channel])
             if stream.type.zero:
                 np.subtract(values, stream.type.zero, out=part, dtype=part.dtype, casting="unsafe")
             else:
@@ -190,7 +210,7 @@ class FlatRecording(Recording):
                 self._files[path] = path.open("rb", buffering=0)
             file = self._files[path]
             file.seek(place)
-            rest = out.data.cast("B")
+            rest = out.reshape(-1).view(np.uint8).data
             while rest:  # one call reads 2 GiB at most
                 n_read = file.readinto(rest)  # type: ignore[attr-defined]
                 if not n_read:

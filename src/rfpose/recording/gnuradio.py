@@ -5,6 +5,7 @@ GNU Radio is no package of Python's index; its headers, serialised polymorphic t
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from fractions import Fraction
@@ -28,18 +29,23 @@ __all__ = ["HEADER_SUFFIX", "GnuRadioRecording", "is_gnuradio_header"]
 HEADER_SUFFIX: Final = ".hdr"
 _TYPES: Final = {0: "ci8", 1: "ci16_le", 2: "ci32_le", 5: "cf32_le"}
 """By GNU Radio's gr_file_types; the machine that wrote them is taken to be little-endian, as all that run it are."""
-_MAGIC: Final = tuple(tag + b"\x07\x02\x00\x07version" for tag in (b"\x07", b"\x09"))
+_BEGINNING: Final = re.compile(
+    rb"[\x07\x09]\x07\x02\x00"
+    rb"(?:\x04strt|\x04size|\x04type|\x04cplx|\x05bytes|\x07version|\x07rx_rate|\x07rx_time)"
+)
+"""A dictionary whose first key is one of a header's; which comes first, GNU Radio's versions and its updates change."""
 _TRUE, _FALSE, _SYMBOL, _INT32, _DOUBLE, _COMPLEX, _NULL, _PAIR = range(8)
 _VECTOR, _DICT, _UNIFORM, _UINT64, _TUPLE, _INT64 = range(8, 14)
 _NUMBERS: Final = {_INT32: ">i", _DOUBLE: ">d", _UINT64: ">Q", _INT64: ">q"}
 _DEPTH: Final = 32
+_SAME_S: Final = Fraction(1, 10**9)
 _SINCE_S: Final = 10**8
 """A time before 1973 counts from the start of a device, not from the epoch."""
 
 
 def is_gnuradio_header(path: Path) -> bool:
     """Whether a file begins as a detached header does; false where it cannot be read."""
-    return head_of(path, 12).startswith(_MAGIC)
+    return _BEGINNING.match(head_of(path, 12)) is not None
 
 
 class GnuRadioRecording(FlatRecording):
@@ -185,11 +191,12 @@ def _stream(
     """Lay the segments out in time; what the last header counts too much or too little is told."""
     n_stored = data.stat().st_size // kind.sample_bytes
     captures, first = [], 0
+    stamps = _stamps(headers, kind, rate)
     for i, header in enumerate(headers):
         n_byte = exact_number("bytes", header.get("bytes"))
         if n_byte.denominator != 1 or n_byte < 0:
             raise InvalidInputError(f"segment {i}: `bytes` must be a count, got {header.get('bytes')!r:.40}")
-        captures.append(Capture(first_sample=min(first, n_stored), stamp=_stamp(i, header, rate)))
+        captures.append(Capture(first_sample=min(first, n_stored), stamp=stamps[i]))
         first += int(n_byte) // kind.sample_bytes
     doubts = []
     if first != n_stored:
@@ -223,11 +230,31 @@ def _stream(
     return stream, float(exact_number("rx_freq", tunings.pop())) if tunings else None
 
 
-def _stamp(i: int, header: dict[str, Any], rate: Fraction) -> Stamp | None:
+def _stamps(headers: list[dict[str, Any]], kind: SampleType, rate: Fraction) -> list[Stamp | None]:
+    """Return when segments begin, None where a header tells nothing that its receiver measured.
+
+    A header that is written because of a tag without a time, such as a gain, repeats the time of the segment before;
+    one that is written because a segment is full has that of the segment before and what that should last. Either may
+    be too early, and neither knows more than the count of samples.
+    """
+    said = [_seconds(header) for header in headers]
+    stamps: list[Stamp | None] = []
+    for i, seconds in enumerate(said):
+        before = said[i - 1] if i else None
+        if seconds is None or (i == 0 and seconds < _SINCE_S):
+            stamps.append(None)
+            continue
+        if before is not None:
+            lasts = exact_number("bytes", headers[i - 1].get("bytes")) / kind.sample_bytes / rate
+            if min(abs(seconds - before), abs(seconds - before - lasts)) < _SAME_S:
+                stamps.append(None)
+                continue
+        stamps.append(Stamp(samples=seconds * rate, resolution=rate / 10**9))
+    return stamps
+
+
+def _seconds(header: dict[str, Any]) -> Fraction | None:
     value = header.get("rx_time")
     if not isinstance(value, tuple) or len(value) != 2:
         return None
-    seconds = exact_number("rx_time", value[0]) + exact_number("rx_time", value[1])
-    if i == 0 and seconds < _SINCE_S:
-        return None
-    return Stamp(samples=seconds * rate, resolution=rate / 10**9)
+    return exact_number("rx_time", value[0]) + exact_number("rx_time", value[1])

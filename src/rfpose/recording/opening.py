@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.kinds import kind_of
+from rfpose.kinds import COMPRESSED_SIGMF, SIGMF_ENDINGS, kind_of
 from rfpose.recording.base import Recording
 from rfpose.recording.declared import Declared
 from rfpose.recording.gnuradio import GnuRadioRecording, is_gnuradio_header
@@ -25,9 +25,7 @@ __all__ = ["RecordingSource", "files_of", "open_recording"]
 RecordingSource: TypeAlias = str | Path | Sequence[str | Path]
 """What `open_recording` opens: one path, or several that make one recording."""
 
-_SIGMF_SUFFIXES = (".sigmf-meta", ".sigmf-data", ".sigmf", ".sigmf-collection")
-_COMPRESSED_SIGMF = (".sigmf.gz", ".sigmf.xz", ".sigmf.zip", ".sigmf.bz2")
-_IN_A_SET = ("*.h5", "*.hdf5", "*.wav", "*.WAV", "*.sigmf", "*.hdr")
+_IN_A_SET = ("*.h5", "*.hdf5", "*.wav", "*.WAV", "*.sigmf", "*.hdr", *(f"*{suffix}" for suffix in COMPRESSED_SIGMF))
 """Files in a directory that may be parts of a recording."""
 
 
@@ -44,9 +42,9 @@ def open_recording(
     ----------
     path
         An rfpose-iq file; a Digital RF directory, whose channels are the receivers; SigMF: a ``.sigmf-meta`` file, a
-        directory of them, an archive or a collection; a WAV file of IQ; a file of GNU Radio with its detached header
-        (``.hdr``); a manifest (``recording.toml``) or the directory of one; a directory of several of these; or
-        a list of all these. Several are one recording: receivers apart, one after the other in time, or both.
+        directory of them, an archive (compressed, too) or a collection; a WAV file of IQ; a file of GNU Radio with its
+        detached header (``.hdr``); a manifest (``recording.toml``) or the directory of one; a directory of several of
+        these; or a list of all these. Several are one recording: receivers apart, one after the other in time, or both.
     scenario
         The site, in place of the one found in the recording. It is not compared with the recording here; see
         `check_against`.
@@ -133,12 +131,10 @@ def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | Non
             return GnuRadioRecording(header, scenario=scenario, follow_links=follow_links)
     if path.is_dir():
         return _open_directory(path, scenario, follow_links=follow_links)
-    if path.suffix in _SIGMF_SUFFIXES:
+    if path.name.endswith(SIGMF_ENDINGS):
         from rfpose.recording.sigmf_files import SigmfRecording
 
         return SigmfRecording(path, scenario=scenario, follow_links=follow_links)
-    if path.name.lower().endswith(_COMPRESSED_SIGMF):
-        raise RecordingError(f"{path}: a compressed SigMF archive; unpack it (`tar xf`) and give the directory")
     return NativeRecording(path, scenario=scenario, follow_links=follow_links)
 
 

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import lzma
 import tarfile
+import tempfile
 import warnings
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 from rfpose.foreign import TEXT_BYTES, exact_number, exact_rate, load_json, parse_json
+from rfpose.kinds import COMPRESSED_SIGMF
 from rfpose.recording.base import IndexArray, SampleFormat
 from rfpose.recording.flat import FlatRecording, FlatStream, SampleType, sample_type
-from rfpose.recording.hdf5 import printable
+from rfpose.recording.hdf5 import FROM_SAMPLES, printable
 from rfpose.recording.links import FOLLOW, refuse_outside
 from rfpose.recording.sidecar import load_sidecar_scenario
 from rfpose.recording.stamps import LARGEST_INDEX, Capture, parse_stamp, place_captures
 from rfpose.scenario import Scenario
 
-__all__ = ["ARCHIVE_SUFFIX", "COLLECTION_SUFFIX", "DATATYPES", "META_SUFFIX", "SigmfRecording", "import_sigmf"]
+__all__ = [
+    "ARCHIVE_SUFFIX",
+    "COLLECTION_SUFFIX",
+    "DATATYPES",
+    "META_SUFFIX",
+    "SigmfRecording",
+    "import_sigmf",
+]
 
 META_SUFFIX: Final = ".sigmf-meta"
 ARCHIVE_SUFFIX: Final = ".sigmf"
@@ -34,6 +48,13 @@ _SINCE_S: Final = 10**8
 """An index without a time stamp that would lie before 1973 counts from something else than the epoch."""
 _MOST_CHANNELS: Final = 1024
 _MOST_MEMBERS: Final = 10_000
+_PIECE_BYTES: Final = 2**22
+_UNPACKED_BYTES: Final = 2**24
+"""So much may come out of a compressed archive besides what its size lets one expect."""
+_UNSOUND: Final = (
+    tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, ValueError, EOFError, OverflowError, RuntimeError,
+)  # fmt: skip
+"""What reading a damaged archive raises; RuntimeError: it is encrypted, or packed in a way that is not known."""
 
 
 def import_sigmf() -> Any:
@@ -79,13 +100,29 @@ class SigmfRecording(FlatRecording):
     """A directory of SigMF recordings, a single one, an archive or a collection. Open it through `open_recording`.
 
     The receiver is named as the file is, channels of one file ``NAME_r0``, ``NAME_r1`` and so on. On how time is found
-    see `place_captures`.
+    see `place_captures`. A compressed archive is unpacked beside what other programs keep for a while (``TMPDIR``), and
+    removed from there when the recording is closed.
     """
 
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         library = import_sigmf()
+        self._unpacked = contextlib.ExitStack()
+        try:
+            self._open(library, path, scenario, follow_links=follow_links)
+        except BaseException:
+            self._unpacked.close()
+            raise
+
+    def _open(self, library: Any, path: Path, scenario: Scenario | None, *, follow_links: bool) -> None:
         notes: list[str] = []
-        signals = {found.name: _signal(library, found) for found in _described(path, notes, follow_links=follow_links)}
+        archive = _archive_of(path)
+        room = None
+        if archive not in (None, "r:"):
+            room = Path(self._unpacked.enter_context(tempfile.TemporaryDirectory(prefix="rfpose-sigmf-")))
+        described = (
+            _described(path, notes, follow_links=follow_links) if archive is None else _in_archive(path, archive, room)
+        )
+        signals = {found.name: _signal(library, found) for found in described}
         if not signals:
             raise RecordingError(f"{path}: holds no metadata of SigMF; check that it is the right file")
         first_name, first = next(iter(signals.items()))
@@ -113,6 +150,26 @@ class SigmfRecording(FlatRecording):
         )
         self.notes = notes
 
+    def files(self) -> list[Path]:
+        """Return what it is read from; what was unpacked is nobody else's."""
+        if _archive_of(self.path) is not None:
+            return [self.path]
+        return super().files()
+
+    def close(self) -> None:
+        """Close the files of samples, and remove what was unpacked."""
+        super().close()
+        self._unpacked.close()
+
+
+def _archive_of(path: Path) -> str | None:
+    """Return how an archive is opened, as `tarfile` says it, or ``zip``; None: it is none."""
+    if path.suffix == ARCHIVE_SUFFIX and path.is_file():
+        return "r:"
+    if not path.name.endswith(COMPRESSED_SIGMF):
+        return None
+    return "zip" if path.suffix == ".zip" else f"r:{path.suffix[1:]}"
+
 
 def _alike(one: SampleType, other: SampleType) -> bool:
     """Whether two types are read as the same numbers."""
@@ -138,9 +195,6 @@ def _described(path: Path, notes: list[str], *, follow_links: bool) -> Iterator[
     """Yield the metadata that a path stands for; what a collection lacks is added to ``notes``."""
     if path.is_dir():
         metas = sorted(path.glob(f"*{META_SUFFIX}"))
-    elif path.suffix == ARCHIVE_SUFFIX:
-        yield from _in_archive(path)
-        return
     elif path.suffix == COLLECTION_SUFFIX:
         metas = _of_collection(path, notes)
     else:
@@ -188,32 +242,61 @@ def _sha512(path: Path) -> str:
         return hashlib.file_digest(file, "sha512").hexdigest()
 
 
-def _in_archive(path: Path) -> Iterator[_Described]:
-    """Yield what an uncompressed archive holds; samples are read where they lie in it."""
+class _Member(NamedTuple):
+    """A file in an archive; ``first``: where its bytes lie in an archive that is not compressed."""
+
+    name: str
+    n_byte: int
+    open: Callable[[], IO[bytes] | None]
+    first: int
+
+
+def _members(path: Path, how: str) -> Iterator[_Member]:
+    if how == "zip":
+        with zipfile.ZipFile(path) as packed:
+            for info in packed.infolist():
+                if not info.is_dir():
+                    yield _Member(info.filename, info.file_size, functools.partial(packed.open, info), 0)
+        return
+    with tarfile.open(path, how) as archive:  # type: ignore[call-overload]
+        for member in archive:
+            if member.isreg() and not member.issparse():
+                open_it = functools.partial(archive.extractfile, member)
+                yield _Member(member.name, member.size, open_it, member.offset_data)
+
+
+def _in_archive(path: Path, how: str, room: Path | None) -> Iterator[_Described]:
+    """Yield what an archive holds; samples are read where they lie in it, those of a compressed one in ``room``."""
     metas: dict[str, str] = {}
     data: dict[str, _Place] = {}
+    left = _UNPACKED_BYTES + FROM_SAMPLES * path.stat().st_size
     try:
-        with tarfile.open(path, "r:") as archive:
-            for i, member in enumerate(archive):
-                if i >= _MOST_MEMBERS:
-                    raise RecordingError(f"{path}: more than {_MOST_MEMBERS} members; unpack it (`tar xf`)")
-                name = printable(Path(member.name).name)
-                if not member.isreg() or member.issparse():
-                    continue
-                if not name.endswith(META_SUFFIX):
-                    data[name] = _Place(path, member.offset_data, member.size)
-                    continue
-                file = archive.extractfile(member)
-                stored = b"" if file is None else file.read(TEXT_BYTES + 1)
-                if len(stored) > TEXT_BYTES:
-                    raise RecordingError(f"{path}: `{name}` is longer than {TEXT_BYTES:_} bytes; check the archive")
-                metas[name] = stored.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: its metadata is not UTF-8; make the archive again") from error
-    except (tarfile.TarError, ValueError, EOFError, OverflowError) as error:
+        for i, member in enumerate(_members(path, how)):
+            if i >= _MOST_MEMBERS:
+                raise RecordingError(f"{path}: more than {_MOST_MEMBERS} members; unpack it and give the directory")
+            name = printable(Path(member.name).name)
+            if name.endswith(META_SUFFIX):
+                metas[name] = _meta_in(path, name, member)
+            elif room is None:
+                data[name] = _Place(path, member.first, member.n_byte)
+            else:
+                left -= member.n_byte
+                if left < 0:
+                    raise RecordingError(
+                        f"{path}: would unpack to more than {FROM_SAMPLES} times its size; check the archive"
+                    )
+                data[name] = _unpacked(path, member, room / str(i))
+    except _UNSOUND as error:
+        if isinstance(error, RecordingError):
+            raise
+        kind = "uncompressed" if room is None else "compressed"
         raise RecordingError(
-            f"{path}: no sound uncompressed archive ({error!s:.100}); unpack it (`tar xf`) and give the directory"
+            f"{path}: no sound {kind} archive ({error!s:.100}); unpack it by other means and give the directory"
         ) from error
+    except OSError as error:  # among them what gzip raises
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{path}: cannot read: {error.strerror or error!s:.100}; check the archive") from error
     size = path.stat().st_size
     for name, text in sorted(metas.items()):
         where = f"{path}: {name}"
@@ -223,11 +306,48 @@ def _in_archive(path: Path) -> Iterator[_Described]:
             found = data.get(wanted) if isinstance(wanted, str) else None
             if found is None:
                 raise RecordingError(f"{where}: its samples, `{wanted!r:.80}`, are not in the archive; make it again")
-            if found.first + found.n_byte > size:
+            if found.file == path and found.first + found.n_byte > size:
                 raise RecordingError(f"{where}: the archive is truncated; copy it again")
             return found
 
         yield _Described(name.removesuffix(META_SUFFIX), where, parse_json(text, source=where), samples)
+
+
+def _meta_in(path: Path, name: str, member: _Member) -> str:
+    """Return metadata out of an archive."""
+    file = member.open()
+    stored = b"" if file is None else file.read(TEXT_BYTES + 1)
+    if len(stored) > TEXT_BYTES:
+        raise RecordingError(f"{path}: `{name}` is longer than {TEXT_BYTES:_} bytes; check the archive")
+    try:
+        return stored.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: its metadata is not UTF-8; make the archive again") from error
+
+
+def _unpacked(path: Path, member: _Member, target: Path) -> _Place:
+    """Unpack a file of samples."""
+    file = member.open()
+    assert file is not None  # only regular files are looked at
+    try:
+        out = target.open("wb")
+    except OSError as error:
+        raise _no_room(path, target, error) from error
+    with file, out:
+        while piece := file.read(_PIECE_BYTES):
+            try:
+                out.write(piece)
+                out.flush()
+            except OSError as error:
+                raise _no_room(path, target, error) from error
+    return _Place(target, 0, target.stat().st_size)
+
+
+def _no_room(path: Path, target: Path, error: OSError) -> RecordingError:
+    return RecordingError(
+        f"{path}: cannot be unpacked into {target.parent.parent}: {error.strerror or error}; set TMPDIR to a directory "
+        "with room for it, or unpack it and give the directory"
+    )
 
 
 def _signal(library: Any, found: _Described) -> _Signal:

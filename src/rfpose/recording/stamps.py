@@ -181,8 +181,7 @@ def _positions(captures: Sequence[Capture], doubts: list[str]) -> list[int]:
 
 def _too_early(i: int, by: int) -> InvalidInputError:
     return InvalidInputError(
-        f"capture {i} starts {by} samples before capture {i - 1} ends; correct its `core:datetime` or "
-        "`core:global_index`"
+        f"capture {i} starts {by} samples before capture {i - 1} ends; correct its time stamp or its index"
     )
 
 

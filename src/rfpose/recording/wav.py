@@ -28,7 +28,7 @@ from rfpose.scenario import Scenario
 
 __all__ = ["WavRecording", "is_wav"]
 
-_TYPES: Final = {(1, 8): "cu8", (1, 16): "ci16_le", (1, 32): "ci32_le", (3, 32): "cf32_le"}
+_TYPES: Final = {(1, 8): "cu8", (1, 16): "ci16_le", (1, 24): "ci24_le", (1, 32): "ci32_le", (3, 32): "cf32_le"}
 """By format code and bits. WAV's bytes have no sign."""
 _EXTENSIBLE: Final = 0xFFFE
 _OPEN_SIZES: Final = (0, 0xFFFFFFFF)
@@ -176,8 +176,8 @@ def _form(path: Path, file: BinaryIO, chunks: Sequence[_Chunk], declared: Declar
     name = _TYPES.get((code, bits))
     if name is None:
         raise RecordingError(
-            f"{path}: holds samples of {bits} bits (format {code}); rfpose reads integers of 8, 16 and 32 bits and "
-            "floats of 32 bits: record or convert it to one of them"
+            f"{path}: holds samples of {bits} bits (format {code}); rfpose reads integers of 8, 16, 24 and 32 bits "
+            "and floats of 32 bits: record or convert it to one of them"
         )
     kind = declared.type if declared.type is not None else sample_type(name)
     if n_channel % 2 or not 2 <= n_channel <= _MOST_CHANNELS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -12,17 +12,27 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.errors import InvalidInputError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.pipeline.clocks import settle_clocks
 from rfpose.pipeline.measure import measure_tones
 from rfpose.pipeline.postures import commanded_normals
 from rfpose.pipeline.site.poses import check_site_solvable
-from rfpose.recording import Recording, check_against, frame_starts, open_recording
+from rfpose.recording import (
+    Recording,
+    RecordingSource,
+    check_against,
+    files_of,
+    frame_starts,
+    note_doubts,
+    open_recording,
+)
+from rfpose.recording.parts import PartsRecording
 from rfpose.scenario import Scenario, scenario_of
 
-__all__ = ["Frames", "Recordings", "commanded_in", "frames_of", "listed", "measured_frames"]
+__all__ = ["Frames", "Recordings", "commanded_in", "frames_of", "inputs_of", "listed", "measured_frames"]
 
-Recordings = Recording | str | Path | Sequence[Recording | str | Path]
-"""One, or several of one site."""
+Recordings = Recording | str | Path | Sequence[Recording | RecordingSource]
+"""One, or several of one site; see `listed`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,22 +55,41 @@ class Frames:
     simulated: bool = False
 
 
-def listed(recordings: Recordings) -> list[Recording | str | Path]:
-    """Return recordings of which one may stand by itself.
+def listed(recordings: Recordings, *, follow_links: bool = False) -> list[Recording | RecordingSource]:
+    """Return recordings of which each stands by itself.
+
+    One may be a directory or a manifest of parts, or a list of them. Paths that hold the same receivers are recordings
+    by themselves; where some hold others, all are parts of one, as for `rfpose.process`.
 
     Raises
     ------
     InvalidInputError
         None at all.
     """
-    many = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    alone = isinstance(recordings, Recording | str | Path)
+    many: list[Recording | RecordingSource] = [recordings] if alone else list(recordings)  # type: ignore[list-item, arg-type]
     if not many:
         raise InvalidInputError("`recordings` must name one recording or more")
+    paths = [one for one in many if isinstance(one, str | Path)]
+    if len(paths) == len(many) > 1 and len(set(_receivers(paths, follow_links=follow_links))) > 1:
+        return [paths]
     return many
 
 
+def _receivers(paths: Sequence[str | Path], *, follow_links: bool) -> Iterator[frozenset[str]]:
+    """Yield who is in each recording; one that cannot be read is for its reader to tell."""
+    for path in paths:
+        with contextlib.suppress(RecordingError, ScenarioError), open_recording(path, follow_links=follow_links) as one:
+            yield frozenset(one.receiver_ids)
+
+
+def inputs_of(recordings: Sequence[Recording | RecordingSource]) -> list[Path]:
+    """Return the files that recordings are read from."""
+    return [file for one in recordings for file in (one.files() if isinstance(one, Recording) else files_of(one))]
+
+
 def frames_of(
-    recordings: Sequence[Recording | str | Path], scenario: Scenario | str | Path | None, *, follow_links: bool
+    recordings: Sequence[Recording | RecordingSource], scenario: Scenario | str | Path | None, *, follow_links: bool
 ) -> tuple[list[Frames], Scenario]:
     """Measure the carriers of recordings of one site: that given, or the first recording's own.
 
@@ -84,7 +113,7 @@ def frames_of(
 
 
 def measured_frames(
-    recording: Recording | str | Path, site: Scenario | None, *, follow_links: bool
+    recording: Recording | RecordingSource, site: Scenario | None, *, follow_links: bool
 ) -> tuple[Frames, Scenario]:
     """Measure the carriers of a recording.
 
@@ -114,12 +143,17 @@ def measured_frames(
         if isinstance(recording, Recording)
         else open_recording(recording, follow_links=follow_links)
     )
-    with opened as one:
+    with contextlib.ExitStack() as stack:
+        one = stack.enter_context(opened)
         chosen = one.scenario if site is None else site
         if chosen is None:
             raise ScenarioError(f"{one.path}: holds no scenario; describe the site in TOML and give `scenario=FILE`")
         check_against(one, chosen)
         check_site_solvable(chosen)
+        if isinstance(one, PartsRecording):
+            one = settle_clocks(one, chosen)
+            stack.callback(one.close)
+        note_doubts(one)
         starts = frame_starts(one, chosen.radio.frame_samples)
         if not len(starts):
             raise ScenarioError(f"{one.path}: no stretch as long as a frame; shorten radio.frame_samples")

@@ -1,0 +1,47 @@
+"""Inputs that a fuzzer found to do harm, made as small as they can be; `scripts/fuzz` looks for more."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+from rfpose.errors import InvalidInputError, RecordingError
+from rfpose.feedback.series import Quantity, read_series_csv
+from rfpose.foreign import read_arrays
+from rfpose.pipeline.inspect import inspect_file
+
+WIND = Quantity(name="speed", units={"mps": 1.0}, unit="m/s", most=100.0, beyond="any wind")
+
+
+def test_two_lines_do_not_ask_for_gigabytes(tmp_path):
+    path = tmp_path / "wind.csv"
+    path.write_text("time,speed_mps\n2025-06-21T08:00:00Z,1\n2026-06-21T08:00:00Z,2\n")
+    with pytest.raises(InvalidInputError, match=r"wind.csv: spans 365 days and tells of 0 of them.* more than 10 s"):
+        read_series_csv(path, WIND, interval_s=1.0, longest_gap_s=10.0)
+    # as long, and told of throughout
+    _, speed = read_series_csv(path, WIND, interval_s=1.0, longest_gap_s=1e9)
+    assert len(speed) == 365 * 86400 + 1
+
+
+def test_what_a_library_quotes_of_a_damaged_archive_is_cut(tmp_path):
+    path = tmp_path / "rays.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x" * 5000 + ".npy", b"")
+        archive.writestr("a.npy", b"")
+    content = path.read_bytes()
+    at = content.rindex(b"x" * 5000)  # in the directory, whose names must be those before the members
+    path.write_bytes(content[:at] + b"a.npy" + b"y" * 4995 + content[at + 5000 :])
+    name = "a.npy" + "y" * 4995
+    with pytest.raises(RecordingError, match=r"rays\.npz: no sound archive") as caught:
+        read_arrays(path, [name.removesuffix(".npy")])
+    assert len(str(caught.value)) < 500 + len(name)
+
+
+def test_what_info_tells_of_mounts_is_ready_for_json(tmp_path):
+    path = tmp_path / "mounts.toml"
+    path.write_text('format = "rfpose-mount"\nversion = 1\n[heliostat.H1]\npivot_enu_m = [1.0, 2.0, 3.0]\n')
+    found = inspect_file(path)
+    assert found["heliostats"]["H1"]["noise_mrad"] is None  # never calibrated
+    json.dumps(found, allow_nan=False)
+    assert np.isfinite(found["heliostats"]["H1"]["pivot_enu_m"]).all()
