@@ -233,6 +233,53 @@ def test_calibrations_are_those_of_one_process_and_a_folder_unseen_is_named(
         _done(by, lambda: rfpose.calibrate(folder))
 
 
+def test_a_track_is_that_of_one_process_whoever_began_it(
+    cluster: distributed.LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rfpose.pipeline.track import track
+
+    class StopError(Exception):
+        pass
+
+    windy = {"record": str(tmp_path / "wind.csv")}
+    # a minute between the lines, since wind that is unknown for longer sends the field to stow
+    lines = [f"{1_773_980_000 + 60 * k},{5 + k % 3}" for k in range(2200)]
+    (tmp_path / "wind.csv").write_text("\n".join(["unix_s,speed_mps", *lines]))
+    hours = {"first_hour": 9.0, "last_hour": 9.3, "days": 2, "wind": windy}
+    site = load_scenario(ROOT / "data" / "tracking_100m.toml").changed(tracking=hours)
+    told: list[tuple[int, int]] = []
+
+    def run(name: str, by: Engine, stop_after: int | None = None) -> bytes | None:
+        def on_progress(*now: int) -> None:
+            told.append(now)
+            if len(told) == stop_after:
+                raise StopError
+
+        told.clear()
+        methods = ("open-loop", "radio-both")
+        job = partial(track, site, tmp_path / name, methods=methods, heliostats=2, checkpoint_s=0.0)
+        try:
+            _done(by, partial(job, on_progress=on_progress))
+        except StopError:
+            assert not (tmp_path / name).exists()
+            return None
+        return (tmp_path / name).read_bytes()
+
+    here, there = Engine(), Engine(scheduler=cluster.scheduler_address)
+    wanted = run("alone.h5", here)
+    # the second day is begun here, and begins again there
+    run("begun.h5", here, stop_after=3)
+    assert run("begun.h5", there) == wanted
+    assert told[-1] == (8, 8)
+    assert told[0][0] > 2
+    run("gathered.h5", there, stop_after=1)
+    assert run("gathered.h5", here) == wanted
+    assert {path.name for path in tmp_path.iterdir()} == {"wind.csv", "alone.h5", "begun.h5", "gathered.h5"}
+    monkeypatch.setattr(Path, "absolute", lambda path: Path("/elsewhere") / path.name)
+    with pytest.raises(InvalidInputError, match=r"worker tcp://[\d.:]+: /elsewhere/wind.csv: cannot read"):
+        run("unseen.h5", there)
+
+
 def test_wrong_choices_are_refused(recording: Path) -> None:
     with pytest.raises(InvalidInputError, match="give one of the two"):
         Engine(scheduler="tcp://host:8786", workers=2)

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 import rfpose
+from rfpose.cli._engine import engine_options
 from rfpose.cli._support import (
     CommonOptions,
     check_ending,
@@ -136,6 +137,7 @@ def _names(_ctx: click.Context, _option: click.Parameter, text: str | None) -> t
     help="Also write one row a method and instant: errors, flux, modes; CSV, or Parquet if it ends so.",
 )
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG or SVG of errors over time and by mirror.")
+@engine_options
 @force_option
 @common_options
 @gathered("changes", _Changes)

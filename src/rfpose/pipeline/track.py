@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rfpose import __version__
-from rfpose.errors import ScenarioError
+from rfpose.engine import is_elsewhere, team_of
+from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.checkpoint import Checkpoint
 from rfpose.scenario import Scenario, naming, scenario_of
 
 if TYPE_CHECKING:
+    from rfpose.feedback.tracking import Portion, TrackingSimulation
     from rfpose.pipeline.formats.track_file import Track
 
 __all__ = ["TrackChanges", "track"]
@@ -58,6 +60,9 @@ def track(
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Track:
     """Track a scenario's field in simulation, by several methods on the same sun, wind and hidden errors.
+
+    With an `rfpose.engine.Engine` of other processes these simulate days and methods side by side; the track is the
+    same.
 
     Parameters
     ----------
@@ -122,28 +127,93 @@ def track(
             "methods": " ".join(m.name for m in simulation.methods),
             "heliostats": str(len(simulation.field)),
         }
-        key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()}
-        for name, path in records.items():
-            if path is not None:
-                key[name] = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        digests = {name: _digest(path) for name, path in records.items() if path is not None}
+        key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()} | digests
         checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
         state = None if checkpoint is None else checkpoint.read()
         with naming(scenario):
             iq = check_with_iq(site, check_iq, seed=seed)
         if state is not None:
             simulation.restore(state)
-        while simulation.done < simulation.n_segment:
-            simulation.advance()
+        run = (
+            _run_elsewhere(simulation, _Job.of(site, heliostats, seed, digests)) if is_elsewhere() else _run(simulation)
+        )
+        for done, total in run:
             if checkpoint is not None:
                 checkpoint.write(simulation.state())
             if on_progress is not None:
-                on_progress(simulation.done, simulation.n_segment)
+                on_progress(done, total)
         found = track_of(simulation, settings, iq=iq)
         if output is not None:
             write_track(found, output)
         if checkpoint is not None:
             job.afterwards(checkpoint.remove)
         return found
+
+
+def _run(simulation: TrackingSimulation) -> Iterator[tuple[int, int]]:
+    """Simulate here; yield (stretches done, stretches in all)."""
+    while simulation.done < simulation.n_segment:
+        simulation.advance()
+        yield simulation.done, simulation.n_segment
+
+
+# -- by others -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Job:
+    """What a worker needs to know to simulate some of it."""
+
+    scenario: Scenario
+    heliostats: int | None
+    seed: int
+    digests: Mapping[str, str]
+    """Of the records that the scenario names."""
+
+    @classmethod
+    def of(cls, site: Scenario, heliostats: int | None, seed: int, digests: Mapping[str, str]) -> _Job:
+        """Return the job for workers whose working directory is another."""
+        table: dict[str, Any] = {}
+        if site.tracking.wind.record is not None:
+            table["wind"] = {"record": str(Path(site.tracking.wind.record).absolute())}
+        if site.tracking.beam_record is not None:
+            table["beam_record"] = str(Path(site.tracking.beam_record).absolute())
+        return cls(scenario=site.changed(tracking=table), heliostats=heliostats, seed=seed, digests=digests)
+
+
+def _run_elsewhere(simulation: TrackingSimulation, job: _Job) -> Iterator[tuple[int, int]]:
+    """Let others simulate; yield (stretches done, stretches in all), each method's counted."""
+    with team_of() as team:
+        portions = simulation.portions(team.n_at_once)
+        total = simulation.n_segment * len(simulation.methods)
+        done = total - sum(map(simulation.n_segment_of, portions))
+        for i, found in team.map(_simulate_there, portions, job):
+            simulation.take(portions[i], found)
+            done += simulation.n_segment_of(portions[i])
+            yield done, total
+
+
+def _simulate_there(job: _Job, portion: Portion) -> Any:
+    """Simulate a portion on a worker."""
+    from rfpose.feedback.tracking import TrackingSimulation
+
+    tracking = job.scenario.tracking
+    for name, path in (("wind", tracking.wind.record), ("beam", tracking.beam_record)):
+        if path is not None and _digest(path) != job.digests[name]:
+            raise InvalidInputError(
+                f"{path}: is another file here than where the job was started; give a path that leads to the same one "
+                "everywhere"
+            )
+    simulation = TrackingSimulation(job.scenario, methods=portion.methods, count=job.heliostats, seed=job.seed)
+    return simulation.go_through(portion)
+
+
+def _digest(path: str) -> str:
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise InvalidInputError(f"{path}: cannot read: {error.strerror or error}") from error
 
 
 def _with(scenario: Scenario, changes: TrackChanges) -> Scenario:

@@ -2,6 +2,6 @@
 
 from rfpose.feedback.tracking.methods import METHODS, Method
 from rfpose.feedback.tracking.score import Score, score
-from rfpose.feedback.tracking.simulation import TrackingSimulation
+from rfpose.feedback.tracking.simulation import Portion, TrackingSimulation
 
-__all__ = ["METHODS", "Method", "Score", "TrackingSimulation", "score"]
+__all__ = ["METHODS", "Method", "Portion", "Score", "TrackingSimulation", "score"]

@@ -22,9 +22,9 @@ from rfpose.feedback.tracking.plant import Plant
 
 __all__ = ["Curves", "KeptCourses", "MethodRun", "MethodSums", "Segment"]
 
-_ARRAYS = (
-    "total", "by_mode", "by_outage", "hours", "histogram", "curve", "trace", "stored_error", "mode_count", "mode",
-)  # fmt: skip
+_BY_DAY = ("total", "by_mode", "by_outage", "hours")
+_BY_TIME = ("curve", "trace", "stored_error", "mode_count", "mode")
+_ARRAYS = (*_BY_DAY, *_BY_TIME, "histogram", "today")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,15 +127,18 @@ class MethodRun:
         n_time = sum(-(-len(day.unix_s) // kept.stride) for day in plant.days)
         self._n_outage = len(plant.scenario.tracking.radio.outages)
         self.engine = MethodEngine(method, plant)
+        # floats are kept by day and added up in the order of days, whoever simulated which of them
         empty = empty_tally(n, self._n_outage)
-        self.total, self.by_mode = (np.repeat(part[None], n_day, axis=0) for part in (empty.total, empty.by_mode))
-        self.by_outage, self.hours, self.histogram = empty.by_outage, empty.hours, empty.histogram
+        self.total, self.by_mode, self.by_outage, self.hours = (
+            np.repeat(part[None], n_day, axis=0) for part in (empty.total, empty.by_mode, empty.by_outage, empty.hours)
+        )
+        self.histogram, self.today = empty.histogram, np.zeros_like(empty.histogram)
         self.curve = np.full((n_time, 4), np.nan)
-        self.trace = np.full((max(n_kept, 1), n_time, 8), np.nan)
+        self.trace = np.full((n_time, n_kept, 8), np.nan)
         self.stored_error = np.full((n_time, n_kept), np.nan)
         self.mode_count = np.zeros((n_time, len(Mode)), np.int32)
         self.mode = np.full((n_time, n_kept), -1, np.int8)
-        self.happened: list[dict[str, Any]] = []
+        self.happened: list[dict[str, Any] | None] = [None] * n_day
         self._operation: Operation | None = None
 
     # -- days ----------------------------------------------------------------------------------------------
@@ -143,6 +146,9 @@ class MethodRun:
     def begin_day(self, i_day: int) -> None:
         """Put motors where the day begins, and take up the model that the method has that morning."""
         plant, day, engine = self._plant, self._plant.days[i_day], self.engine
+        self.drop_today()
+        for name in _BY_DAY:
+            getattr(self, name)[i_day] = 0.0
         engine.rest(plant.first_count(day))
         # overnight counts are referenced anew; what was learned of counts that homing moved is worth nothing then
         homed = np.zeros(len(plant.field), np.bool_)
@@ -169,9 +175,8 @@ class MethodRun:
         """Take the method through a stretch: at once, or from word to word of its field control."""
         plant, engine, operation, stored = self._plant, self.engine, self._operation, self._kept.stored
         day, stride, n_step = plant.days[segment.i_day], self._kept.stride, segment.end - segment.first
-        tally = _kernels.Tally(
-            self.total[segment.i_day], self.by_mode[segment.i_day], self.by_outage, self.hours, self.histogram
-        )
+        total, by_mode, by_outage, hours = (getattr(self, name)[segment.i_day] for name in _BY_DAY)
+        tally = _kernels.Tally(total, by_mode, by_outage, hours, self.today)
         courses = empty_courses(len(plant.field), stored, n_step, stride)
         stretch = engine.stretch(day, slice(segment.first, segment.end), draws, tally, courses)
         true = stretch.mounts.true
@@ -192,11 +197,14 @@ class MethodRun:
         at = slice(segment.first_stored, segment.first_stored + courses.error.shape[1])
         self.curve[at, :3] = _over_field(courses.error)
         self.curve[at, 3] = courses.light[..., 0].sum(axis=0) / courses.light[..., 1].sum(axis=0)
-        self.trace[:, at] = courses.trace
+        self.trace[at] = np.swapaxes(courses.trace[: len(stored)], 0, 1)
         self.stored_error[at] = courses.error[stored].T
-        if operation is not None and segment.end == len(day.unix_s):
-            operation.end()
-            self.happened.append({"day": str(day.date)} | operation.report())
+        if segment.end == len(day.unix_s):
+            self.histogram += self.today
+            self.today[:] = 0
+            if operation is not None:
+                operation.end()
+                self.happened[segment.i_day] = {"day": str(day.date)} | operation.report()
 
     # -- results -------------------------------------------------------------------------------------------
 
@@ -205,14 +213,14 @@ class MethodRun:
         return MethodSums(
             total=read_only(self.total),
             by_mode=read_only(self.by_mode),
-            by_outage=read_only(self.by_outage[:, : self._n_outage]),
-            hours=read_only(self.hours),
-            histogram=read_only(self.histogram),
+            by_outage=read_only(self.by_outage.sum(axis=0)[:, : self._n_outage]),
+            hours=read_only(self.hours.sum(axis=0)),
+            histogram=read_only(self.histogram + self.today),
         )
 
     def curves(self) -> Curves:
         """Return the courses so far."""
-        trace = np.swapaxes(self.trace[: len(self._kept.stored)], 0, 1)
+        trace = self.trace
         return Curves(
             rms_rad=read_only(self.curve[:, 0]),
             p95_rad=read_only(self.curve[:, 1]),
@@ -226,6 +234,26 @@ class MethodRun:
             mode=read_only(self.mode),
         )
 
+    # -- days that somebody else goes through --------------------------------------------------------------
+
+    def part(self, days: slice, times: slice) -> Arrays:
+        """Return what whole days gave, of a run that went through no others; ``times``: those of its courses."""
+        found = {name: getattr(self, name)[days] for name in _BY_DAY}
+        found |= {name: getattr(self, name)[times] for name in _BY_TIME}
+        return found | {"histogram": self.histogram, "happened": _as_array(self.happened[days])}
+
+    def put(self, days: slice, times: slice, part: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Take over what `part` gave elsewhere."""
+        for names, at in ((_BY_DAY, days), (_BY_TIME, times)):
+            for name in names:
+                getattr(self, name)[at] = part[name]
+        self.histogram += part["histogram"]
+        self.happened[days] = _from_array(part["happened"])
+
+    def drop_today(self) -> None:
+        """Forget the day under way; the next to be gone through begins."""
+        self.today[:] = 0
+
     # -- interruption --------------------------------------------------------------------------------------
 
     def _own_arrays(self) -> Arrays:
@@ -234,7 +262,7 @@ class MethodRun:
     def arrays(self) -> Arrays:
         """Return all that going on depends on, by name."""
         found = self._own_arrays()
-        found["happened"] = np.frombuffer(json.dumps(self.happened).encode(), np.uint8).copy()
+        found["happened"] = _as_array(self.happened)
         if self._operation is not None:
             found |= {f"operation/{name}": values for name, values in self._operation.state().items()}
         return found
@@ -243,11 +271,20 @@ class MethodRun:
         """Go back to what `arrays` gave in the course of a day."""
         for name, values in self._own_arrays().items():
             values[...] = arrays[name]
-        self.happened = json.loads(bytes(arrays["happened"]).decode())
-        self._operation = self._operate(i_day)
+        self.happened = _from_array(arrays["happened"])
+        place = "operation/"
+        operation = {k[len(place) :]: v for k, v in arrays.items() if k.startswith(place)}
+        self._operation = self._operate(i_day) if operation else None
         if self._operation is not None:
-            place = "operation/"
-            self._operation.restore({k[len(place) :]: v for k, v in arrays.items() if k.startswith(place)})
+            self._operation.restore(operation)
+
+
+def _as_array(plain: Any) -> npt.NDArray[np.uint8]:
+    return np.frombuffer(json.dumps(plain).encode(), np.uint8).copy()
+
+
+def _from_array(stored: npt.NDArray[Any]) -> Any:
+    return json.loads(bytes(stored).decode())
 
 
 def _over_field(error: FloatArray) -> FloatArray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,10 +25,19 @@ from rfpose.feedback.tracking.radio import RadioByPosture
 from rfpose.feedback.tracking.run import Curves, KeptCourses, MethodRun, MethodSums, Segment
 from rfpose.scenario import Scenario
 
-__all__ = ["Curves", "MethodSums", "TrackingSimulation"]
+__all__ = ["Curves", "MethodSums", "Portion", "TrackingSimulation"]
 
 SEGMENT_S = 900.0
 """Simulated time between two points at which a run can be taken up again."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Portion:
+    """Days of some methods, from ``first_day`` to before ``end_day``, which depend on no others."""
+
+    methods: tuple[str, ...]
+    first_day: int
+    end_day: int
 
 
 class TrackingSimulation:
@@ -75,7 +86,9 @@ class TrackingSimulation:
                 who_of(event, self.field, plan.field_control.bus.cluster_size)
         calibrator = Calibrator(self.plant, self.radio)
         kept = KeptCourses(stored=self.stored, stride=self._stride)
-        self._runs = {m.name: MethodRun(m, self.plant, calibrator, kept) for m in self.methods}
+        self._new_run = {m.name: partial(MethodRun, m, self.plant, calibrator, kept) for m in self.methods}
+        self._runs = {name: new() for name, new in self._new_run.items()}
+        self._over = {name: np.zeros(len(self.days), np.bool_) for name in self._runs}
         self._gust_state = self.plant.gusts.process.start(generator(self.plant.seed, 1, 0), n)
         self._beside = ThreadPoolExecutor(1, "rfpose-wind")
         self.done = 0
@@ -125,15 +138,25 @@ class TrackingSimulation:
     def advance(self) -> None:
         """Simulate the next stretch of time."""
         segment = self.segments[self.done]
+        left = [name for name, over in self._over.items() if not over[segment.i_day]]
+        if left:
+            self._advance(segment, left)
+        self.done += 1
+
+    def _advance(self, segment: Segment, names: Sequence[str]) -> None:
+        """Take methods through a stretch."""
+        runs = [self._runs[name] for name in names]
         if segment.first == 0:
             start = generator(self.plant.seed, 1, segment.i_day)
             self._gust_state[:] = self.plant.gusts.process.start(start, len(self.field))
-            for run in self._runs.values():
+            for run in runs:
                 run.begin_day(segment.i_day)
         draws = self._draw(segment)
-        for run in self._runs.values():
+        for run in runs:
             run.go_through(segment, draws)
-        self.done += 1
+        if segment.end == len(self.days[segment.i_day].unix_s):
+            for name in names:
+                self._over[name][segment.i_day] = True
 
     def _draw(self, segment: Segment) -> StretchDraws:
         """Draw what a stretch brings to all methods."""
@@ -148,6 +171,8 @@ class TrackingSimulation:
         rng = generator(plant.seed, 3, *place)
         noise = rng.standard_normal((n, n_frame, 2), dtype=np.float32)
         lost = (rng.random((n, n_frame), dtype=np.float32) < plan.radio.lost_frames).astype(np.uint8)
+        # before radio's, which are drawn only where there is a method that needs it
+        swing = plant.gusts.draw_swing(rng, (n, n_step))
         spread, bias = np.zeros((n, 3)), np.zeros((n, 2))
         if self.radio is not None:
             errors = self.radio.errors(plant.wanted_normal_enu(day, (segment.first + segment.end) // 2), rng)
@@ -156,7 +181,7 @@ class TrackingSimulation:
         return StretchDraws(
             mean_mps=plant.gusts.mean_mps,
             gust=gust.result(),
-            swing=plant.gusts.draw_swing(rng, (n, n_step)),
+            swing=swing,
             noise=noise,
             lost=lost,
             outage=self._outage(day.hour[steps]),
@@ -174,6 +199,53 @@ class TrackingSimulation:
             out[hit[:, None] & dark[None]] = i + 1
         return out
 
+    # -- by several ----------------------------------------------------------------------------------------
+
+    def portions(self, n_at_once: int) -> list[Portion]:
+        """Return what is left in portions for so many workers, the longest first; a day under way begins again.
+
+        A method that learns takes its model from day to day and is one portion. Days of the others depend on nothing
+        but the seed; where there are fewer days than workers, their methods are shared out, too.
+        """
+        self.done, n_day, learning, days = 0, len(self.days), [], []
+        for method in self.methods:
+            self._runs[method.name].drop_today()
+            if method.learns and not self._over[method.name].all():
+                self._runs[method.name] = self._new_run[method.name]()
+                self._over[method.name][:] = False
+                learning.append(Portion(methods=(method.name,), first_day=0, end_day=n_day))
+        for i_day in range(n_day):
+            left = [m.name for m in self.methods if not m.learns and not self._over[m.name][i_day]]
+            n_group = min(len(left), max(1, -(-n_at_once // n_day)))
+            groups = (tuple(left[i::n_group]) for i in range(n_group))
+            days += [Portion(methods=group, first_day=i_day, end_day=i_day + 1) for group in groups]
+        return learning + days
+
+    def n_segment_of(self, portion: Portion) -> int:
+        """Return how many stretches a portion's days have, counted once a method."""
+        n = sum(portion.first_day <= segment.i_day < portion.end_day for segment in self.segments)
+        return n * len(portion.methods)
+
+    def go_through(self, portion: Portion) -> dict[str, Arrays]:
+        """Simulate a portion, of a simulation of its methods alone, and return what `take` wants."""
+        self.done = next(i for i, segment in enumerate(self.segments) if segment.i_day == portion.first_day)
+        while self.done < self.n_segment and self.segments[self.done].i_day < portion.end_day:
+            self.advance()
+        return {name: self._runs[name].part(*self._place_of(portion)) for name in portion.methods}
+
+    def take(self, portion: Portion, found: Mapping[str, Mapping[str, npt.NDArray[Any]]]) -> None:
+        """Take over a portion that another simulation with the same arguments went through."""
+        days, times = self._place_of(portion)
+        for name in portion.methods:
+            self._runs[name].put(days, times, found[name])
+            self._over[name][days] = True
+
+    def _place_of(self, portion: Portion) -> tuple[slice, slice]:
+        """Return a portion's days, and its times among all instants kept."""
+        ends = np.cumsum([0, *(-(-len(day.unix_s) // self._stride) for day in self.days)])
+        days = slice(portion.first_day, portion.end_day)
+        return days, slice(int(ends[days.start]), int(ends[days.stop]))
+
     # -- results -------------------------------------------------------------------------------------------
 
     def sums(self, name: str) -> MethodSums:
@@ -186,7 +258,7 @@ class TrackingSimulation:
 
     def happened(self, name: str) -> list[dict[str, Any]]:
         """Return what a method's field control has to tell of each day that is over; empty without field control."""
-        return list(self._runs[name].happened)
+        return [each for each in self._runs[name].happened if each is not None]
 
     # -- interruption --------------------------------------------------------------------------------------
 
@@ -195,6 +267,7 @@ class TrackingSimulation:
         found: Arrays = {"done": np.array(self.done), "gust": self._gust_state}
         for name, run in self._runs.items():
             found |= {f"{name}/{part}": values for part, values in run.arrays().items()}
+            found[f"{name}/over"] = self._over[name]
         return found
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
@@ -205,3 +278,4 @@ class TrackingSimulation:
         for name, run in self._runs.items():
             place = f"{name}/"
             run.restore({k[len(place) :]: v for k, v in state.items() if k.startswith(place)}, i_day)
+            self._over[name][:] = state[f"{place}over"]
