@@ -18,7 +18,8 @@ from rich.table import Table
 
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
+from rfpose.multilat.integrity.guard import limit, noncentrality
+from rfpose.multilat.integrity.hypotheses import judge
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 
 TRANSMITTER = 100.0 * np.array(

@@ -10,7 +10,8 @@ import pytest
 
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.hypotheses import judge, limit, noncentrality
+from rfpose.multilat.integrity.guard import limit, noncentrality
+from rfpose.multilat.integrity.hypotheses import judge
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 

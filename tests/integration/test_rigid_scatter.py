@@ -8,7 +8,8 @@ import pytest
 from rfpose.geometry import angle_between_rad, rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, rigid_bound, solve_rigid, tilt_sigma_rad
-from rfpose.multilat.rigid.integers import align_points, solve_ladder
+from rfpose.multilat.rigid.integers import solve_ladder
+from rfpose.multilat.rigid.start import align_points
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2

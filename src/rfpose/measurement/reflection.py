@@ -47,8 +47,8 @@ def reflectors_of(scenario: Scenario, model: str) -> tuple[Reflector, ...]:
     return (ground, *walls)
 
 
-def check_reflectors(scenario: Scenario, reflectors: tuple[Reflector, ...]) -> None:
-    """Refuse planes behind which something stands that is to be reflected in them.
+def check_reflectors(scenario: Scenario, model: str) -> None:
+    """Refuse planes, as of `reflectors_of`, behind which something stands that is to be reflected in them.
 
     Raises
     ------
@@ -57,6 +57,7 @@ def check_reflectors(scenario: Scenario, reflectors: tuple[Reflector, ...]) -> N
     GeometryError
         Names the plane and what lies behind it.
     """
+    reflectors = reflectors_of(scenario, model)
     if reflectors:
         scenario.need_rf_carriers("the model of reflections")
     standing = (

@@ -35,11 +35,14 @@ class Wavelengths:
         Zero for the carrier [Hz].
     wavelength_m : (group, transmitter)
         [m].
+    clock_class : (group,)
+        Which clocks each sees.
     """
 
     tone: npt.NDArray[np.int64]
     tone_hz: FloatArray
     wavelength_m: FloatArray
+    clock_class: npt.NDArray[np.int64]
 
     @property
     def n_tone(self) -> int:
@@ -51,16 +54,9 @@ class Wavelengths:
         """(group,) whether it is the carrier's own phase."""
         return np.asarray(self.tone == CARRIER)
 
-    @property
-    def clock_class(self) -> npt.NDArray[np.int64]:
-        """(group,) which clocks each sees."""
-        return clock_classes(len(self.tone))
-
     def kept(self, which: npt.NDArray[np.bool_]) -> Wavelengths:
         """Return some of them."""
-        return Wavelengths(
-            tone=self.tone[which], tone_hz=self.tone_hz[which], wavelength_m=read_only(self.wavelength_m[which])
-        )
+        return _wavelengths(self.tone[which], self.tone_hz[which], self.wavelength_m[which])
 
 
 def wavelengths_of(scenario: Scenario, *, carrier: bool = False) -> Wavelengths:
@@ -71,4 +67,13 @@ def wavelengths_of(scenario: Scenario, *, carrier: bool = False) -> Wavelengths:
     if carrier:
         tone, tone_hz = np.append(tone, CARRIER), np.append(tone_hz, 0.0)
         wavelength = np.vstack([wavelength, scenario.radio.propagation_speed_mps / scenario.carrier_rf_hz])
-    return Wavelengths(tone=read_only(tone), tone_hz=read_only(tone_hz), wavelength_m=read_only(wavelength))
+    return _wavelengths(tone, tone_hz, wavelength)
+
+
+def _wavelengths(tone: npt.NDArray[np.int64], tone_hz: FloatArray, wavelength_m: FloatArray) -> Wavelengths:
+    return Wavelengths(
+        tone=read_only(tone),
+        tone_hz=read_only(tone_hz),
+        wavelength_m=read_only(wavelength_m),
+        clock_class=read_only(clock_classes(len(tone))),
+    )

@@ -16,7 +16,7 @@ from rfpose.multilat.ground import ground_bound
 from rfpose.multilat.rigid import MirrorProblem, full_covariance, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, is_calibrated, mirror_groups
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, mirror_groups
 from rfpose.pipeline.noise import PhaseNoise
 from rfpose.scenario import Scenario
 
@@ -66,7 +66,7 @@ def normal_bound_rad(
     for group in mirror_groups(scenario):
         rot = rot_enu_from_mirror(normal_enu[:, group.column].reshape(-1, 3))
         cov = _rigid(scenario, choice, noise, group, rot, coefficient)
-        if group.learns_delays:
+        if group.estimator.delay_drift_m_per_sqrt_s is not None:
             cov = _learned(group, rot, cov, time_s)
         out[:, group.column] = tilt_sigma_rad(cov[:, :6, :6], rot[:, :, 2]).reshape(len(start), -1)
     return out
@@ -98,7 +98,7 @@ def _rigid(
 ) -> FloatArray:
     """Covariance of pose and clocks of a group's mirrors, first axis frame × heliostat."""
     n_frame = len(noise.tone_rad)
-    calibration = noise.calibration_rad if is_calibrated(scenario) else None
+    calibration = noise.calibration_rad if scenario.is_calibrated else None
     sigma, common = group.range_noise(noise.tone_rad, noise.carrier_rad, calibration)
     mirrors = MirrorProblem.expected(
         scenario.transmitter_enu_m,

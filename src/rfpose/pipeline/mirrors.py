@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -14,14 +14,21 @@ from rfpose.dsp import PhaseCalibration, TonePhases
 from rfpose.dsp.calibration import PhaseAverage
 from rfpose.measurement import Estimator, Wavelengths, estimator_of, wavelengths_of
 from rfpose.measurement.wavelengths import CARRIER
-from rfpose.multilat import RangeDifferences
+from rfpose.multilat import FixStatus, RangeDifferences
 from rfpose.multilat.ground import CalibrationSight
-from rfpose.multilat.rigid import MirrorKnowledge, Observation
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid.start import align_points, rotations_from_differences
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.result import FixTable
 from rfpose.scenario import Scenario
 
+IntArray = npt.NDArray[np.int64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-__all__ = ["MirrorGroup", "calibration_sight", "is_calibrated", "mirror_groups", "observations"]
+__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "mirror_groups", "mirror_problems"]
+
+_VAGUE_RATIO = 100.0
+"""A calibration off by so many times what the pivot is off by tells nothing of the pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,11 +56,6 @@ class MirrorGroup:
     pivot_enu_m: FloatArray
     estimator: Estimator
     waves: Wavelengths
-
-    @property
-    def learns_delays(self) -> bool:
-        """Whether delays between receivers are learned over frames."""
-        return self.estimator.delay_drift_m_per_sqrt_s is not None
 
     def knowledge(self, n_frame: int) -> MirrorKnowledge:
         """Return what is known of these mirrors, one row a frame and heliostat."""
@@ -93,6 +95,23 @@ class MirrorGroup:
         return np.stack(sigma, axis=1), np.stack(common, axis=1)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigidInputs:
+    """What the stages before found, and how to go on."""
+
+    tones: TonePhases
+    calibration: PhaseCalibration
+    ranges: RangeDifferences
+    fixes: FixTable
+    scenario: Scenario
+    choice: PoseChoice
+
+    @property
+    def n_frame(self) -> int:
+        """Frames."""
+        return len(self.tones.frame_start_index)
+
+
 def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
     """Sort heliostats by number of receivers and by what is known of them."""
     kinds: dict[tuple[int, Estimator], list[int]] = {}
@@ -111,19 +130,47 @@ def mirror_groups(scenario: Scenario) -> Iterator[MirrorGroup]:
         )
 
 
-def is_calibrated(scenario: Scenario) -> bool:
-    """Whether the transmitters' electronic phases are measured; if not, receivers of a mirror are compared."""
-    return bool(scenario.calibration_receiver)
+def mirror_problems(
+    inputs: RigidInputs,
+) -> Iterator[tuple[MirrorGroup, MirrorProblem, list[tuple[IntArray, MirrorProblem]]]]:
+    """Yield the problem that each group's mirrors pose, one row a frame and heliostat.
+
+    Some of its mirrors may begin elsewhere, too: their rows, and where.
+    """
+    for group in mirror_groups(inputs.scenario):
+        problem = _problem_of(inputs, group)
+        direct = inputs.choice.reflection == "none"
+        yield group, problem, _either_side(inputs, group, problem) if direct else []
 
 
-def observations(
-    tones: TonePhases, calibration: PhaseCalibration, ranges: RangeDifferences, scenario: Scenario, group: MirrorGroup
-) -> list[Observation]:
+def _problem_of(inputs: RigidInputs, group: MirrorGroup) -> MirrorProblem:
+    """Return the problem that a group's mirrors pose, one row a frame and heliostat."""
+    places = np.tile(group.places_m, (inputs.n_frame, 1, 1))
+    pivot, rot = align_points(places, _located(inputs, group))
+    problem = MirrorProblem.of_observations(
+        inputs.scenario.transmitter_enu_m,
+        places,
+        _observations(inputs, group),
+        start_pivot_enu_m=pivot,
+        start_rot_enu_from_mirror=rot,
+        knowledge=group.knowledge(inputs.n_frame),
+    )
+    if inputs.choice.reflection == "none":
+        problem = _without_vague_calibration(problem)
+    known, weak = problem.knowledge, np.flatnonzero(_are_vague(inputs, group, places))
+    if known.pivot_enu_m is not None and weak.size:
+        pivot[weak] = known.pivot_enu_m[weak]
+        rot[weak] = rotations_from_differences(replace(problem, start_pivot_enu_m=pivot).take(weak))
+    return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
+
+
+def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
     """Phases of a group's mirrors as ranges, in the order of its wavelengths; first axis frame × heliostat.
 
     Without calibration receivers the transmitters' own phases stay in, unknown: differences between receivers tell.
     """
-    calibrated = is_calibrated(scenario)
+    tones, calibration = inputs.tones, inputs.calibration
+    calibrated = inputs.scenario.is_calibrated
     sigma, common = group.range_noise(
         tones.sigma_rad, tones.carrier_sigma_rad, calibration.sigma_rad if calibrated else None
     )
@@ -138,8 +185,8 @@ def observations(
         if k == 0 and not calibrated:
             z = _coarse_uncalibrated(z, float(wavelength[0]))
         elif k == 0:
-            reference = group.of_mirrors(ranges.reference.astype(np.float64))
-            z = _coarse(z, group.of_mirrors(ranges.range_difference_m), reference, float(wavelength[0]))
+            reference = group.of_mirrors(inputs.ranges.reference.astype(np.float64))
+            z = _coarse(z, group.of_mirrors(inputs.ranges.range_difference_m), reference, float(wavelength[0]))
         out.append(
             Observation(
                 range_m=z,
@@ -182,6 +229,50 @@ def _coarse_uncalibrated(z: FloatArray, wavelength: float) -> FloatArray:
     common = np.angle((phasor * np.exp(-1j * turn * clock)).sum(axis=1, keepdims=True)) / turn
     left = z - clock - common
     return np.asarray(left - wavelength * np.rint(left / wavelength) + common + clock)
+
+
+def _located(inputs: RigidInputs, group: MirrorGroup) -> FloatArray:
+    """(mirror, receiver, xyz) where each receiver was located by itself [m]."""
+    return group.of_mirrors(inputs.fixes.position_enu_m)
+
+
+def _either_side(
+    inputs: RigidInputs, group: MirrorGroup, problem: MirrorProblem
+) -> list[tuple[IntArray, MirrorProblem]]:
+    """Mirrors with a fix that may be on either side of the transmitters' plane: all below it, then all above it."""
+    rows = np.flatnonzero((group.of_mirrors(inputs.fixes.status) == FixStatus.AMBIGUOUS).any(axis=1))
+    if not rows.size:
+        return []
+    middle = problem.transmitter_enu_m.mean(axis=0)
+    up = np.linalg.svd(problem.transmitter_enu_m - middle)[2][-1]
+    up = up if up[2] >= 0.0 else -up
+    located = _located(inputs, group)
+    height = ((located - middle) @ up)[..., None]
+    sides = []
+    for sign in (-1.0, 1.0):
+        pivot, rot = align_points(problem.receiver_mirror_m, located + (sign * np.abs(height) - height) * up)
+        sides.append((rows, replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot).take(rows)))
+    return sides
+
+
+def _without_vague_calibration(problem: MirrorProblem) -> MirrorProblem:
+    """Leave an old calibration out where the pivot is known far better than it could tell: differences remain.
+
+    What it adds is next to nothing, and so little that the clocks' equations would be singular to working precision.
+    """
+    common = problem.transmitter_sigma_m
+    vague = common > _VAGUE_RATIO * problem.knowledge.pivot_sigma_m
+    return replace(problem, transmitter_sigma_m=np.where(vague, np.inf, common))
+
+
+def _are_vague(inputs: RigidInputs, group: MirrorGroup, places: FloatArray) -> npt.NDArray[np.bool_]:
+    """(mirror,) whether a receiver's fix, if there is one, is less certain than the mirror is wide.
+
+    So it is without calibration receivers, or with a calibration that is old.
+    """
+    variance = np.trace(group.of_mirrors(inputs.fixes.cov_enu_m2), axis1=-2, axis2=-1)
+    width = np.linalg.norm(places - places.mean(axis=1, keepdims=True), axis=-1).max(axis=1)
+    return np.asarray(~(np.sqrt(variance) < width[:, None]).all(axis=1))
 
 
 def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDArray[np.int64]) -> CalibrationSight:

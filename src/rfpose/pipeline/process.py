@@ -276,9 +276,7 @@ def _settings(
         command += " --integrity" if asked["integrity"] else " --no-integrity"
     if asked["filter"] is not None:
         command += " --filter" if asked["filter"] else " --no-filter"
-    from rfpose.pipeline.mirrors import mirror_groups
-
-    learns = choice.pose == "rigid" and any(group.learns_delays for group in mirror_groups(scenario))
+    learns = choice.pose == "rigid" and scenario.learns_delays
     return {
         "version": __version__,
         "command": command,

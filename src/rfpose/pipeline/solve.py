@@ -14,7 +14,7 @@ import numpy.typing as npt
 from rfpose.checks import read_only
 from rfpose.dsp import CalibrationStatus, PhaseCalibration, TonePhases, calibrate
 from rfpose.errors import GeometryError, ScenarioError
-from rfpose.measurement import check_reflectors, reflectors_of
+from rfpose.measurement import check_reflectors
 from rfpose.multilat import (
     Fixes,
     FixStatus,
@@ -28,7 +28,6 @@ from rfpose.multilat import (
 from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result
-from rfpose.pipeline.mirrors import is_calibrated
 from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
 from rfpose.pipeline.stages import Stopwatch
 from rfpose.scenario import Scenario
@@ -72,7 +71,7 @@ def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None =
     if not scenario.heliostat:
         raise ScenarioError(f"scenario `{scenario.name}` has no heliostat to measure; add a [[heliostat]]")
     check_transmitters(scenario.transmitter_enu_m)
-    if is_calibrated(scenario):
+    if scenario.is_calibrated:
         check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
     else:
         _check_solvable_by_differences(scenario, chosen)
@@ -80,7 +79,7 @@ def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None =
         from rfpose.pipeline.site import check_site_solvable
 
         check_site_solvable(scenario)
-    check_reflectors(scenario, reflectors_of(scenario, chosen.reflection))
+    check_reflectors(scenario, chosen.reflection)
 
 
 def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> None:
@@ -153,8 +152,8 @@ def solve(
     """
     check_solvable(scenario, pose=choice.pose, choice=choice)
     with contextlib.nullcontext() if stages is None else stages.during("calibration"):
-        calibration = calibrate(tones, scenario) if is_calibrated(scenario) else _no_calibration(tones)
-    ranges = _ranges(tones, calibration, scenario) if is_calibrated(scenario) else _no_ranges(tones)
+        calibration = calibrate(tones, scenario) if scenario.is_calibrated else _no_calibration(tones)
+    ranges = _ranges(tones, calibration, scenario) if scenario.is_calibrated else _no_ranges(tones)
     poses = solve_poses(
         scenario.transmitter_enu_m,
         ranges.range_difference_m,
@@ -166,7 +165,7 @@ def solve(
     )
     n_frame, n_receiver = tones.phase_rad.shape[:2]
     fixes = _fix_table(poses.fixes, n_frame, n_receiver)
-    if not is_calibrated(scenario):
+    if not scenario.is_calibrated:
         fixes = replace(fixes, status=np.where(_received(tones).any(axis=2), FixStatus.UNCALIBRATED, fixes.status))
     independent = _pose_table(poses, len(scenario.tone))
     found: RigidOutcome | SiteOutcome | None = None

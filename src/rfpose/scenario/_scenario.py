@@ -195,6 +195,16 @@ class Scenario(Record):
                 "`radio.centre_frequency_hz`, or leave reflections out"
             )
 
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the transmitters' electronic phases are measured; if not, receivers of a mirror are compared."""
+        return bool(self.calibration_receiver)
+
+    @property
+    def learns_delays(self) -> bool:
+        """Whether any heliostat's delays between receivers are learned over frames."""
+        return any(h.receiver_delay_drift_s_per_sqrt_min is not None for h in self.heliostat)
+
     def compares_carriers(self, heliostat: Heliostat) -> bool:
         """Whether the carriers' own phases are compared between a heliostat's receivers.
 

@@ -9,7 +9,8 @@ from rfpose.errors import InvalidInputError
 from rfpose.geometry import rot_enu_from_mirror
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.integrity.hypotheses import judge, log_probability, noncentrality
+from rfpose.multilat.integrity.guard import log_probability, noncentrality
+from rfpose.multilat.integrity.hypotheses import judge
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
 from sites import TABLE_2
 

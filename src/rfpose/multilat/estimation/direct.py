@@ -1,38 +1,77 @@
-"""Poses by the direct ray alone, wavelength by wavelength, guarded."""
+"""Poses by the direct ray alone, wavelength by wavelength, guarded; and what estimators do with what they find."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray
-from rfpose.multilat.estimation.found import (
-    RESIDUAL_PROBABILITY,
-    PoseEstimates,
-    are_doubted,
-    joined,
-    put_rows,
-    residual_probability,
-)
+from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.fix import APART_SIGMA, DECISIVE_CHI2
-from rfpose.multilat.integrity import Alarms, GuardedPoses, TransmitterStatus, solve_with_integrity
-from rfpose.multilat.rigid import MirrorProblem, solve_rigid
+from rfpose.multilat.integrity.guard import solve_with_integrity, widened
+from rfpose.multilat.integrity.records import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
+from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.multilat.rigid.integers import solve_ladder
+from rfpose.multilat.rigid.pose import MirrorProblem, RigidPoses, solve_rigid
 from rfpose.multilat.status import PoseStatus
 
-__all__ = ["solve_direct"]
+__all__ = ["PoseEstimates", "are_doubted", "finished", "joined", "protected", "solve_direct"]
 
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+RESIDUAL_PROBABILITY = 1e-9
+"""A pose whose residuals are rarer than this under the reported noise is marked."""
 _LEFT_OUT_CHI2 = 2.0 * DECISIVE_CHI2
 """What each transmitter or prior that was left out counts, where two poses of a mirror are compared."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseEstimates:
+    """Poses of mirrors, and how they came about; None where an estimator does not look for it.
+
+    Attributes
+    ----------
+    poses
+    status : (mirror,)
+        `PoseStatus`.
+    fixed, wrong_risk, method : (mirror, group)
+        As in `rfpose.multilat.rigid.integers.RigidSolution`.
+    problem
+        As solved in the end: integers resolved, NaN where left out.
+    full_cov : (mirror, unknown, unknown)
+        Of pose and clocks, where it is more than that of ``problem`` alone.
+    guard
+        The tests.
+    probability_all : (mirror,)
+        Probability of the residuals with nothing left out.
+    coefficient, coefficient_sigma : (mirror, reflector), (mirror, reflector, 2)
+        Of what reflects.
+    probability_direct : (mirror,)
+        Of the residuals with the direct ray alone.
+    """
+
+    poses: RigidPoses
+    status: IntArray
+    fixed: BoolArray
+    wrong_risk: FloatArray
+    method: IntArray
+    problem: MirrorProblem
+    full_cov: FloatArray | None = None
+    guard: GuardedPoses | None = None
+    probability_all: FloatArray | None = None
+    coefficient: npt.NDArray[np.complex128] | None = None
+    coefficient_sigma: FloatArray | None = None
+    probability_direct: FloatArray | None = None
 
 
 def solve_direct(
     problem: MirrorProblem,
     alarms: Alarms | None,
-    again: Iterable[tuple[npt.NDArray[np.int64], MirrorProblem]] = (),
+    again: Iterable[tuple[IntArray, MirrorProblem]] = (),
 ) -> PoseEstimates:
     """Solve by the direct ray: leave out what is wrong in the coarsest tone, climb, test all wavelengths together.
 
@@ -48,10 +87,10 @@ def solve_direct(
     found = _solve_from(problem, alarms)
     for rows, other in again:
         found = _decided(found, rows, _solve_from(other, alarms))
-    return found
+    return finished(found, alarms)
 
 
-def _decided(found: PoseEstimates, rows: npt.NDArray[np.int64], other: PoseEstimates) -> PoseEstimates:
+def _decided(found: PoseEstimates, rows: IntArray, other: PoseEstimates) -> PoseEstimates:
     """Keep the better of two poses of some mirrors; where neither is clearly better, say so."""
     doubted = (PoseStatus.OK, PoseStatus.AMBIGUOUS)
     here, there = np.isin(found.status[rows], doubted), other.status == PoseStatus.OK
@@ -123,3 +162,84 @@ def _probability_of_all(problem: MirrorProblem, first: GuardedPoses, probability
     if rows.size:
         out[rows] = residual_probability(solve_rigid(problem.groups(slice(1)).take(rows)))
     return out
+
+
+def residual_probability(poses: RigidPoses) -> FloatArray:
+    """Return the probability of residuals as large as these or larger."""
+    from scipy.special import chdtrc
+
+    with np.errstate(invalid="ignore"):
+        return np.asarray(chdtrc(np.maximum(poses.dof, 1.0), poses.chi2))
+
+
+def are_doubted(guard: GuardedPoses) -> BoolArray:
+    """(mirror,) not explained, or explained by leaving out so much that nothing confirms it."""
+    unconfirmed = _left_out(guard) & (guard.status == IntegrityStatus.NO_REDUNDANCY)
+    return np.asarray((guard.status == IntegrityStatus.UNEXPLAINED) | unconfirmed)
+
+
+def put_rows(first: PoseEstimates, rows: IntArray, second: PoseEstimates, those: IntArray) -> PoseEstimates:
+    """Return poses with some mirrors' replaced by those of another solution."""
+    return cast("PoseEstimates", _put(first, rows, second, those))
+
+
+def _put(first: Any, rows: IntArray, second: Any, those: IntArray) -> Any:
+    if first is None:
+        return None
+    if isinstance(first, MirrorProblem):
+        return replace(first, range_m=_put(first.range_m, rows, second.range_m, those))
+    if is_dataclass(first) and not isinstance(first, type):
+        values = {f.name: _put(getattr(first, f.name), rows, getattr(second, f.name), those) for f in fields(first)}
+        return replace(first, **values)
+    out = np.array(first)
+    out[rows] = second[those]
+    return out
+
+
+def joined(first: GuardedPoses, second: GuardedPoses) -> GuardedPoses:
+    """Join the tests before and after a change of what is used: what the first left out, the second does not see."""
+    cause = np.where(
+        second.transmitter_status > TransmitterStatus.NOT_RECEIVED, second.transmitter_status, first.transmitter_status
+    )
+    status = second.status.copy()
+    level = second.protection_level_rad.copy()
+    quiet = np.isin(second.status, (IntegrityStatus.OK, IntegrityStatus.EXCLUDED))
+    excluded = (cause > TransmitterStatus.NOT_RECEIVED).any(axis=1)
+    status[quiet & excluded] = IntegrityStatus.EXCLUDED
+    # which of several causes an error had is not known better afterwards
+    ambiguous = quiet & (first.status == IntegrityStatus.AMBIGUOUS)
+    status[ambiguous] = IntegrityStatus.AMBIGUOUS
+    level[ambiguous] = np.fmax(level, first.protection_level_rad)[ambiguous]
+    lost = quiet & (first.status == IntegrityStatus.UNEXPLAINED)
+    status[lost] = IntegrityStatus.UNEXPLAINED
+    level[lost] = np.inf
+    return replace(
+        second,
+        status=read_only(status),
+        transmitter_status=read_only(cause),
+        protection_level_rad=read_only(level),
+        prior_testable=read_only(first.prior_testable | second.prior_testable),
+        chi2_probability=second.chi2_probability,
+    )
+
+
+def _left_out(guard: GuardedPoses) -> BoolArray:
+    """(mirror,) whether any transmitter or prior was."""
+    excluded = (guard.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1)
+    return np.asarray(excluded | guard.prior_rejected.any(axis=1))
+
+
+def finished(found: PoseEstimates, alarms: Alarms | None) -> PoseEstimates:
+    """Let covariances say what protection levels do, and mark poses that tell too little of the normal."""
+    if alarms is not None:
+        found = protected(found, alarms.missed_detection)
+    vague = ~(found.poses.tilt_sigma_rad <= MAX_SIGMA_RAD)
+    return replace(found, status=np.where((found.status == PoseStatus.OK) & vague, PoseStatus.UNCERTAIN, found.status))
+
+
+def protected(found: PoseEstimates, missed: float) -> PoseEstimates:
+    """Let covariances say what protection levels do, where something was left out; ``missed`` is theirs."""
+    guard = found.guard
+    if guard is None:
+        return found
+    return replace(found, poses=widened(found.poses, _left_out(guard), guard.protection_level_rad, missed))

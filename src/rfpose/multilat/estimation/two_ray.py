@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.multilat.estimation.found import PoseEstimates, are_doubted, joined
+from rfpose.multilat.estimation.direct import PoseEstimates, are_doubted, finished, joined
 from rfpose.multilat.ground import CalibrationSight, GroundSolution, Reflector, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid import MirrorProblem, RigidPoses, solve_rigid
@@ -85,7 +85,7 @@ def solve_two_ray(
     """
     problem = _better_start(problem, surveyed_enu_m)
     parts = [_two_ray_of(problem.take(rows), reflections.take(rows), alarms, heliostat[rows]) for rows in shared]
-    return _in_order(parts, np.argsort(np.concatenate(shared)), problem)
+    return finished(_in_order(parts, np.argsort(np.concatenate(shared)), problem), alarms)
 
 
 def _better_start(problem: MirrorProblem, surveyed_enu_m: FloatArray) -> MirrorProblem:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.ground._problem import GroundProblem, follow
-from rfpose.multilat.rigid.fits import RigidFits
+from rfpose.multilat.rigid.pose import RigidFits
 from rfpose.multilat.status import has_start
 
 __all__ = ["MAX_CONDITION", "find", "information", "refine", "retry", "trusted"]

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.equations import MirrorArrays
 from rfpose.multilat.reflection import SharedGeometry, direct_rays, shifts_at_points
-from rfpose.multilat.rigid.fits import FLOOR, FitRule, RigidFits, begin, fit, predict
-from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.pose import FLOOR, FitRule, MirrorProblem, RigidFits, begin, fit, predict
 
 __all__ = ["CalibrationSight", "GroundProblem", "build", "follow"]
 
@@ -157,7 +156,7 @@ class GroundProblem:
         enough: FloatArray | float = np.inf,
         max_iteration: int = _RULE.max_iteration,
     ) -> None:
-        """`rfpose.multilat.rigid.fits.fit` of every mirror at given coefficients."""
+        """`rfpose.multilat.rigid.pose.fit` of every mirror at given coefficients."""
         rule = _RULE._replace(max_iteration=max_iteration)
         fit(self.scene_at(parameter), self.mirrors, rule, fits, turn=turn, enough=enough)
 

@@ -13,7 +13,7 @@ from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._problem import CalibrationSight, build
 from rfpose.multilat.ground.model import SPEED_OF_LIGHT_MPS, Reflector, build_scene
 from rfpose.multilat.ground.solve import joint_covariance
-from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.pose import MirrorProblem
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["ground_bound"]

@@ -14,10 +14,9 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.ground._problem import GroundProblem
 from rfpose.multilat.ground.solve import GroundSolution, turns
-from rfpose.multilat.integrity.guard import Alarms, Guard, GuardedPoses, TransmitterStatus
-from rfpose.multilat.integrity.hypotheses import Verdict
-from rfpose.multilat.rigid.fits import RigidFits
-from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.multilat.integrity.guard import Guard
+from rfpose.multilat.integrity.records import Alarms, GuardedPoses, TransmitterStatus, Verdict
+from rfpose.multilat.rigid.pose import PRIORS, RigidFits
 from rfpose.multilat.status import PoseStatus, has_start
 
 __all__ = ["guard_with_ground"]

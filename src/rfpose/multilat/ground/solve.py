@@ -27,9 +27,7 @@ from rfpose.multilat.ground.model import (
     build_scene,
     heights_m,
 )
-from rfpose.multilat.rigid.fits import RigidFits
-from rfpose.multilat.rigid.pose import RigidPoses
-from rfpose.multilat.rigid.problem import MirrorProblem, Observation
+from rfpose.multilat.rigid.pose import MirrorProblem, Observation, RigidFits, RigidPoses
 from rfpose.multilat.status import PoseStatus, has_start
 
 __all__ = ["GroundSolution", "joint_covariance", "solve_with_ground", "turns"]

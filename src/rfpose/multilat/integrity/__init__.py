@@ -1,7 +1,7 @@
 """Outliers found and left out, and what could still be wrong unnoticed."""
 
-from rfpose.multilat.integrity.exclusion import solve_with_integrity
-from rfpose.multilat.integrity.guard import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
+from rfpose.multilat.integrity.guard import solve_with_integrity
+from rfpose.multilat.integrity.records import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.robust import RobustFixes, locate_robust
 
 __all__ = [

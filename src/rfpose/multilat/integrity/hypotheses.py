@@ -7,28 +7,17 @@ equations; without a fault it is chi²-distributed with as many degrees of freed
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray, read_only
+from rfpose.checks import FloatArray
 from rfpose.multilat.integrity import _kernels
+from rfpose.multilat.integrity.records import Verdict
 from rfpose.multilat.reflection import direct_rays
 from rfpose.multilat.rigid import MirrorProblem, RigidPoses
-from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.multilat.rigid.pose import PRIORS
 
-__all__ = [
-    "Verdict",
-    "judge",
-    "largest_eigenvalue",
-    "limit",
-    "log_probability",
-    "noncentrality",
-    "quiet_median",
-    "tilt_quantile",
-    "widened",
-]
+__all__ = ["judge"]
 
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -36,48 +25,7 @@ BoolArray = npt.NDArray[np.bool_]
 _FLOOR = 1e-8
 """Redundancy below which a fault counts as invisible."""
 _TIE_FLOOR = 1e-6
-"""As `rfpose.multilat.rigid.problem.STIFFEST_TIE`, so that freeing a tie stands out of its rounding."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """Statistics of all hypotheses: transmitters first, then `PRIORS`.
-
-    Attributes
-    ----------
-    ok : (mirror,)
-        Whether the pose was determined at all; False: the rest is 0.
-    stat, dof : (mirror, hypothesis)
-        Drop of chi², and degrees of freedom; 0 = cannot be tested.
-    hidden : (mirror, hypothesis)
-        Part of the fault leaves no trace in the residuals, yet tilts the normal.
-    shift_rad : (mirror, hypothesis, 2)
-        What the fault, as estimated, did to the normal: rotation about the mirror's x and y axes.
-    spread_rad2 : (mirror, hypothesis, 2, 2)
-        What leaving it free adds to the covariance of that rotation.
-    cov_rad2 : (mirror, 2, 2)
-        Covariance of that rotation, nothing left free.
-    common, common_dof : (mirror, transmitter)
-        The same for an error common to all receivers.
-    link, link_dof : (mirror, receiver, transmitter)
-        The same for an error at one receiver.
-    """
-
-    ok: BoolArray
-    stat: FloatArray
-    dof: IntArray
-    hidden: BoolArray
-    shift_rad: FloatArray
-    spread_rad2: FloatArray
-    cov_rad2: FloatArray
-    common: FloatArray
-    common_dof: IntArray
-    link: FloatArray
-    link_dof: IntArray
-
-    def take(self, rows: IntArray) -> Verdict:
-        """Select mirrors."""
-        return Verdict(**{f.name: getattr(self, f.name)[rows] for f in fields(Verdict)})
+"""As `rfpose.multilat.rigid.pose.STIFFEST_TIE`, so that freeing a tie stands out of its rounding."""
 
 
 def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
@@ -161,80 +109,3 @@ def _free_prior(
         tests.stat[m, h], tests.dof[m, h], tests.hidden[m, h] = _kernels.explain(
             matrix[k], right[k], tilt[k], _FLOOR, blind[k], tests.shift[m, h], tests.spread[m, h]
         )
-
-
-def log_probability(stat: FloatArray, dof: IntArray) -> FloatArray:
-    """Logarithm of the probability that chi² of ``dof`` exceeds ``stat``; 0 without degrees of freedom."""
-    from scipy.special import gammaincc, gammaln
-
-    half, x = np.maximum(dof, 1) / 2.0, np.maximum(stat, 0.0) / 2.0
-    far = x > 300.0 + half
-    with np.errstate(divide="ignore"):
-        near = np.log(gammaincc(half, np.where(far, 0.0, x)))
-        # first terms of the asymptotic series of Γ(a, x)
-        tail = (half - 1.0) * np.log(x) - x - gammaln(half) + np.log1p(np.where(far, (half - 1.0) / x, 0.0))
-    return np.asarray(np.where(dof > 0, np.where(far, tail, near), 0.0))
-
-
-def limit(probability: float | FloatArray, dof: IntArray) -> FloatArray:
-    """Value that chi² of ``dof`` exceeds with ``probability``."""
-    from scipy.special import chdtri
-
-    return np.asarray(np.where(dof > 0, chdtri(np.maximum(dof, 1), probability), np.inf))
-
-
-def noncentrality(threshold: FloatArray, dof: IntArray, missed: float) -> FloatArray:
-    """Noncentrality at which a chi² of ``dof`` stays below ``threshold`` with probability ``missed``."""
-    from scipy.special import chndtrinc
-
-    out = np.full(dof.shape, np.inf)
-    for d in np.unique(dof[dof > 0]):
-        at = dof == d
-        out[at] = chndtrinc(threshold[at][0], float(d), missed)
-    return out
-
-
-def largest_eigenvalue(matrix: FloatArray) -> FloatArray:
-    """Larger eigenvalue of symmetric 2×2 matrices."""
-    a, b, d = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]
-    return np.asarray(0.5 * (a + d) + np.sqrt(0.25 * (a - d) ** 2 + b * b))
-
-
-def tilt_quantile(probability: float) -> float:
-    """How many of its larger sigmas a two-dimensional normal error exceeds with at most ``probability``."""
-    return float(np.sqrt(-2.0 * np.log(probability)))
-
-
-def widened(poses: RigidPoses, left_out: BoolArray, level_rad: FloatArray, missed: float) -> RigidPoses:
-    """Return poses whose covariance allows for what their protection levels do, where something was left out.
-
-    Where one transmitter proved wrong, the others are no longer known to be right: the normal's standard deviation,
-    whichever way, is at least that of an error which exceeds the level with probability ``missed``.
-
-    Parameters
-    ----------
-    poses
-    left_out : (mirror,)
-        Where any transmitter or prior was.
-    level_rad : (mirror,)
-        Protection level; where it is infinite nothing is changed.
-    missed
-        Missed-detection probability of the level.
-    """
-    rows = np.flatnonzero(left_out & np.isfinite(level_rad) & np.isfinite(poses.cov).all(axis=(1, 2)))
-    cov = np.array(poses.cov)
-    axes = poses.rot_enu_from_mirror[rows][:, :, :2]
-    size, way = np.linalg.eigh(np.swapaxes(axes, 1, 2) @ cov[rows, 3:, 3:] @ axes)
-    lacking = np.maximum((level_rad[rows, None] / tilt_quantile(missed)) ** 2 - size, 0.0)
-    turn = axes @ way
-    cov[rows, 3:, 3:] += (turn * lacking[:, None]) @ np.swapaxes(turn, 1, 2)
-    return replace(poses, cov=read_only(cov))
-
-
-def quiet_median(x: FloatArray) -> FloatArray:
-    """Median over the last axis without NaN; NaN where nothing is left."""
-    ordered = np.sort(x, axis=-1)  # NaN last
-    count = np.isfinite(x).sum(axis=-1)
-    low, high = (np.maximum(k, 0)[..., None] for k in ((count - 1) // 2, np.minimum(count // 2, x.shape[-1] - 1)))
-    middle = 0.5 * (np.take_along_axis(ordered, low, -1) + np.take_along_axis(ordered, high, -1))[..., 0]
-    return np.asarray(np.where(count > 0, middle, np.nan))

@@ -14,10 +14,9 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray, as_float_array
+from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid.pose import RigidPoses, solve_rigid
-from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.pose import MirrorProblem, RigidPoses, solve_rigid
 from rfpose.multilat.rigid.search import (
     DELAY_REACH_M,
     Candidates,
@@ -28,7 +27,7 @@ from rfpose.multilat.rigid.search import (
 )
 from rfpose.multilat.status import PoseStatus
 
-__all__ = ["IntegerMethod", "RigidSolution", "align_points", "common_offset", "solve_ladder"]
+__all__ = ["IntegerMethod", "RigidSolution", "common_offset", "solve_ladder"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -103,37 +102,6 @@ class RigidSolution:
     odds_against: FloatArray
     adop_cycles: FloatArray
     range_m: FloatArray
-
-
-def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Rotation and origin that put mirror coordinates onto measured points best (Kabsch 1976).
-
-    Parameters
-    ----------
-    receiver_mirror_m : (mirror, receiver, xyz)
-        [m].
-    receiver_enu_m : (mirror, receiver, xyz)
-        [m]; a mirror with a NaN gives NaN.
-
-    Returns
-    -------
-    origin_enu_m : (mirror, xyz)
-    rot_enu_from_mirror : (mirror, 3, 3)
-    """
-    mirror = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
-    enu = as_float_array("receiver_enu_m", receiver_enu_m, mirror.shape, finite=False)
-    good: BoolArray = np.asarray(np.isfinite(enu).all(axis=(1, 2)))
-    points = np.where(good[:, None, None], enu, mirror)
-    mean_mirror, mean_enu = mirror.mean(axis=1, keepdims=True), points.mean(axis=1, keepdims=True)
-    cross = np.swapaxes(points - mean_enu, 1, 2) @ (mirror - mean_mirror)
-    u, _, vt = np.linalg.svd(cross)
-    flip = np.ones((len(mirror), 3))
-    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
-    rot = (u * flip[:, None, :]) @ vt
-    origin = mean_enu[:, 0] - np.einsum("mab,mb->ma", rot, mean_mirror[:, 0])
-    rot[~good] = np.nan
-    origin[~good] = np.nan
-    return origin, rot
 
 
 def solve_ladder(problem: MirrorProblem, *, wrong_risk: float = 1e-6, search: bool = True) -> RigidSolution:
@@ -316,21 +284,20 @@ def _round(problem: MirrorProblem, k: int, prediction: PredictedRanges) -> tuple
     """Round the integers of wavelength k; return resolved ranges and the risk that any is wrong (mirror,)."""
     from scipy.special import erfc
 
-    observation, known = problem.observation(k), problem.knowledge
-    slope = prediction.slope
-    wavelength = observation.wavelength_m
-    left = observation.range_m - prediction.distance_m
-    calibrated = np.isfinite(observation.transmitter_sigma_m).all()
+    range_m, own, common = problem.range_m[:, k], problem.sigma_m[:, k], problem.transmitter_sigma_m[:, k]
+    known, wavelength, slope = problem.knowledge, problem.wavelength_m[k], prediction.slope
+    left = range_m - prediction.distance_m
+    calibrated = np.isfinite(common).all()
     # what clocks add is found from the ranges themselves: the mean over transmitters says nothing about integers
     centred = slope - slope.mean(axis=2, keepdims=True)
     offset_free = True
     if calibrated:
         slope = centred
-        noise = observation.sigma_m**2 + observation.transmitter_sigma_m[:, None] ** 2
+        noise = own**2 + common[:, None] ** 2
     else:
         # only differences between receivers mean anything
         left = left - left[:, :1]
-        noise = observation.sigma_m**2 + observation.sigma_m[:, :1] ** 2
+        noise = own**2 + own[:, :1] ** 2
         offset_free = not np.isfinite(known.clock_sigma_m)
         slope = centred - centred[:, :1] if offset_free else slope - slope[:, :1]
         noise = noise if offset_free else noise + 2.0 * known.clock_sigma_m**2
@@ -350,7 +317,7 @@ def _round(problem: MirrorProblem, k: int, prediction: PredictedRanges) -> tuple
         axis=1
     )
     risk = np.where(np.isfinite(left).any(axis=(1, 2)), np.minimum(risk, 1.0), 1.0)
-    return observation.range_m - turns * wavelength, risk
+    return range_m - turns * wavelength, risk
 
 
 def common_offset(left: FloatArray, wavelength: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.equations import rotate
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.pose import MirrorProblem
 
 __all__ = ["ReceiverPlaces", "places_bound", "refine_places"]
 

@@ -15,8 +15,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.ambiguity import integer_least_squares
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.pose import RigidPoses
-from rfpose.multilat.rigid.problem import MirrorKnowledge, MirrorProblem
+from rfpose.multilat.rigid.pose import MirrorKnowledge, MirrorProblem, RigidPoses
 
 __all__ = ["Candidates", "PredictedRanges", "can_search", "predict", "search_integers"]
 

@@ -1,4 +1,4 @@
-"""Where to begin without calibration: orientations from differences between a mirror's receivers.
+"""Where to begin: from located receivers, or without calibration from differences between a mirror's receivers.
 
 Receivers of a mirror are metres apart and transmitters much farther, so a receiver's range to transmitter i changes by
 u_i · R a, u_i the direction to the pivot and a the receiver's place about the mean of all. What a transmitter itself is
@@ -9,11 +9,12 @@ rotations from the best of many.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from rfpose.checks import FloatArray
-from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.checks import FloatArray, as_float_array
+from rfpose.multilat.rigid.pose import MirrorProblem
 
-__all__ = ["rotations_from_differences"]
+__all__ = ["align_points", "rotations_from_differences"]
 
 _N_TRIAL = 1500
 """Rotations to begin from, some 15° apart: nearer than the quadratic form's minima are wide."""
@@ -24,6 +25,37 @@ _ROWS = 1024
 _N_STEP = 25
 _FLOOR = 1e-9
 """Of the information that nuisance unknowns have anyway, relative: their common constant is not seen."""
+
+
+def align_points(receiver_mirror_m: npt.ArrayLike, receiver_enu_m: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Rotation and origin that put mirror coordinates onto measured points best (Kabsch 1976).
+
+    Parameters
+    ----------
+    receiver_mirror_m : (mirror, receiver, xyz)
+        [m].
+    receiver_enu_m : (mirror, receiver, xyz)
+        [m]; a mirror with a NaN gives NaN.
+
+    Returns
+    -------
+    origin_enu_m : (mirror, xyz)
+    rot_enu_from_mirror : (mirror, 3, 3)
+    """
+    mirror = as_float_array("receiver_mirror_m", receiver_mirror_m, ("mirror", "receiver", 3))
+    enu = as_float_array("receiver_enu_m", receiver_enu_m, mirror.shape, finite=False)
+    good: npt.NDArray[np.bool_] = np.asarray(np.isfinite(enu).all(axis=(1, 2)))
+    points = np.where(good[:, None, None], enu, mirror)
+    mean_mirror, mean_enu = mirror.mean(axis=1, keepdims=True), points.mean(axis=1, keepdims=True)
+    cross = np.swapaxes(points - mean_enu, 1, 2) @ (mirror - mean_mirror)
+    u, _, vt = np.linalg.svd(cross)
+    flip = np.ones((len(mirror), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+    rot = (u * flip[:, None, :]) @ vt
+    origin = mean_enu[:, 0] - np.einsum("mab,mb->ma", rot, mean_mirror[:, 0])
+    rot[~good] = np.nan
+    origin[~good] = np.nan
+    return origin, rot
 
 
 def rotations_from_differences(problem: MirrorProblem) -> FloatArray:

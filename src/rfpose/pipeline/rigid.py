@@ -1,26 +1,38 @@
-"""The result's tables, filled group by group: poses, integrity, reflection, delays, filtered poses."""
+"""Rigid poses of a recording's mirrors by the chosen estimator, direct or two-ray, and the result's tables of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
+from rfpose.dsp import PhaseCalibration, TonePhases
+from rfpose.dsp.calibration import frame_times, phase_average
 from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix
-from rfpose.multilat import FilterSettings, FilterStatus, PoseStatus, filter_poses
-from rfpose.multilat.estimation import PoseEstimates
+from rfpose.measurement import reflectors_of
+from rfpose.multilat import FilterSettings, FilterStatus, PoseStatus, RangeDifferences, filter_poses
+from rfpose.multilat.estimation import PoseEstimates, ReflectionModel, protected, solve_direct, solve_two_ray
+from rfpose.multilat.integrity import Alarms
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.pipeline.formats.result import DelayTable, FilteredTable, IntegrityTable, PoseTable, ReflectionTable
-from rfpose.pipeline.mirrors import (
-    MirrorGroup,
-    mirror_groups,
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.result import (
+    DelayTable,
+    FilteredTable,
+    FixTable,
+    IntegrityTable,
+    PoseTable,
+    ReflectionTable,
 )
-from rfpose.pipeline.rigid.inputs import RigidInputs
+from rfpose.pipeline.mirrors import MirrorGroup, RigidInputs, calibration_sight, mirror_problems
+from rfpose.scenario import Scenario
+
+__all__ = ["RigidOutcome", "solve_rigid_poses"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -37,13 +49,96 @@ class RigidOutcome:
     filtered: FilteredTable | None
 
 
-class RigidTables:
+def solve_rigid_poses(
+    tones: TonePhases,
+    calibration: PhaseCalibration,
+    ranges: RangeDifferences,
+    fixes: FixTable,
+    independent: PoseTable,
+    scenario: Scenario,
+    choice: PoseChoice,
+    *,
+    sample_rate: Fraction,
+) -> RigidOutcome:
+    """Solve every mirror of every frame as a rigid body.
+
+    The coarsest tone comes first, finer tones and the carrier follow where their whole wavelengths are safe. The
+    carrier is used between receivers on one oscillator.
+
+    Parameters
+    ----------
+    tones, calibration, ranges, fixes
+        The stages before.
+    independent
+        Normals of separately located receivers: where a mirror cannot be solved as a whole, its status.
+    scenario
+        The site.
+    choice
+        The estimator; its ``pose`` is ``rigid``.
+    sample_rate
+        Of the recording, for the time between frames [1/s].
+    """
+    inputs = RigidInputs(
+        tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice
+    )
+    tables = _Tables(inputs, independent)
+    start = tones.frame_start_index
+    time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
+    for group, problem, again in mirror_problems(inputs):
+        found = _solved(inputs, group, problem, again)
+        if group.estimator.delay_drift_m_per_sqrt_s is not None:
+            found = protected(tables.put_delays(group, found, time_s), scenario.integrity.missed_detection)
+        tables.put(group, found)
+        if choice.filtered:
+            tables.put_filtered(group, found, time_s, exposure_s=float(scenario.radio.frame_samples / sample_rate))
+    return tables.outcome()
+
+
+def _solved(
+    inputs: RigidInputs, group: MirrorGroup, problem: MirrorProblem, again: list[tuple[IntArray, MirrorProblem]]
+) -> PoseEstimates:
+    """Solve one group of mirrors by the chosen estimator."""
+    alarms = _alarms(inputs)
+    if inputs.choice.reflection == "none":
+        return solve_direct(problem, alarms, again)
+    scenario, tones = inputs.scenario, inputs.tones
+    row = np.arange(len(problem.range_m)).reshape(inputs.n_frame, -1)
+    frame, heliostat = (index.ravel() for index in np.indices(row.shape))
+    average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
+    reflections = ReflectionModel(
+        reflectors=reflectors_of(scenario, inputs.choice.reflection),
+        carrier_rf_hz=scenario.carrier_rf_hz,
+        calibration=calibration_sight(average, scenario, frame),
+        free_space=scenario.reflection.spreading == "free_space",
+        propagation_speed_mps=scenario.radio.propagation_speed_mps,
+    )
+    return solve_two_ray(
+        problem,
+        reflections,
+        alarms,
+        surveyed_enu_m=np.tile(group.pivot_enu_m, (inputs.n_frame, 1)),
+        heliostat=heliostat,
+        shared={"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared],
+    )
+
+
+def _alarms(inputs: RigidInputs) -> Alarms | None:
+    """When to leave something out; None: never."""
+    table = inputs.scenario.integrity
+    if not inputs.choice.integrity:
+        return None
+    return Alarms(
+        false_alarm=table.false_alarm, missed_detection=table.missed_detection, max_excluded=table.max_excluded
+    )
+
+
+class _Tables:
     """The result's tables, filled group by group."""
 
-    def __init__(self, stages: RigidInputs, independent: PoseTable) -> None:
-        self._stages = stages
-        scenario, choice = stages.scenario, stages.choice
-        n_frame = self._n_frame = len(stages.tones.frame_start_index)
+    def __init__(self, inputs: RigidInputs, independent: PoseTable) -> None:
+        scenario, choice = inputs.scenario, inputs.choice
+        self._scenario = scenario
+        n_frame = self._n_frame = len(inputs.tones.frame_start_index)
         frame_mirror = (n_frame, len(scenario.heliostat))
         n_receiver = len(scenario.receivers)
         self._poses = {name: np.array(getattr(independent, name)) for name in PoseTable.__dataclass_fields__}
@@ -75,7 +170,7 @@ class RigidTables:
             }
             self._filtered["status"] = np.full(frame_mirror, FilterStatus.UNKNOWN, np.int8)
         self._delays: dict[str, npt.NDArray[Any]] = {}
-        if any(group.learns_delays for group in mirror_groups(scenario)):
+        if scenario.learns_delays:
             n_clock = len(scenario.tone) + 1
             self._delays = {
                 "delay_s": np.full((n_frame, n_receiver, n_clock), np.nan),
@@ -133,7 +228,7 @@ class RigidTables:
 
     def _methods(self, group: MirrorGroup, found: PoseEstimates) -> IntArray:
         """(mirror, clock) how integers were found; what a pose that failed rests on says nothing."""
-        out = np.full((len(found.method), len(self._stages.scenario.tone) + 1), IntegerMethod.FLOAT, np.int64)
+        out = np.full((len(found.method), len(self._scenario.tone) + 1), IntegerMethod.FLOAT, np.int64)
         out[:, : found.method.shape[1]] = np.where(np.isfinite(found.poses.tilt_sigma_rad)[:, None], found.method, 0)
         return out
 
@@ -143,7 +238,7 @@ class RigidTables:
         def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
             return array.reshape(self._n_frame, len(group.column), *array.shape[1:])
 
-        poses, table = found.poses, self._stages.scenario.motion
+        poses, table = found.poses, self._scenario.motion
         tracked = filter_poses(
             by_frame(poses.pivot_enu_m),
             by_frame(poses.rot_enu_from_mirror),
@@ -177,7 +272,7 @@ class RigidTables:
 
     def put_delays(self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray) -> PoseEstimates:
         """Learn the delays of a group over frames, write them, and return its poses refined by them."""
-        scenario = self._stages.scenario
+        scenario = self._scenario
         speed = scenario.radio.propagation_speed_mps
         n_frame, n_helio = self._n_frame, len(group.column)
         poses, whole = found.poses, _with_clocks(found)
