@@ -170,7 +170,7 @@ def test_receiver_that_is_not_in_the_recording(
     tmp_path: Path, clean: dict[str, Result], caplog: pytest.LogCaptureFixture
 ) -> None:
     site = tmp_path / "site.toml"
-    site.write_text(_scenario((0, 1, 4)).to_toml())
+    _scenario((0, 1, 4)).save(site)
     recording = _record(tmp_path / "rec.h5", _scenario())
     with caplog.at_level(logging.WARNING):
         result = process(recording, tmp_path / "result.h5", scenario=site)
@@ -191,46 +191,22 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _record(tmp_path_factory.mktemp("recording") / "rec.h5", _scenario(frame_count=1))
 
 
-def _no_calibration(data: dict[str, Any]) -> None:
-    data["calibration_receiver"] = ()
-
-
-def _no_heliostat(data: dict[str, Any]) -> None:
-    data["heliostat"] = ()
-
-
-def _four_transmitters(data: dict[str, Any]) -> None:
-    data["transmitter"] = data["transmitter"][:4]
-
-
-def _short_tone(data: dict[str, Any]) -> None:
-    data["tone"][0]["frequency_hz"] = 1.5e6
-
-
-def _other_rate(data: dict[str, Any]) -> None:
-    data["radio"]["sample_rate_hz"] = 41e6
-
-
-def _long_frame(data: dict[str, Any]) -> None:
-    data["radio"]["frame_samples"] = N_SAMPLE + 1
-
-
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (_no_calibration, ScenarioError, "no calibration receiver.*calibration_receiver"),
-        (_no_heliostat, ScenarioError, "no heliostat"),
-        (_four_transmitters, GeometryError, "5 or more transmitters"),
-        (_short_tone, GeometryError, "ambiguous.*add a tone"),
-        (_other_rate, ScenarioError, "41000000"),
-        (_long_frame, RecordingError, "no stretch as long as a frame of 8001"),
+        ({"calibration_receiver": ()}, ScenarioError, "no calibration receiver.*calibration_receiver"),
+        ({"heliostat": ()}, ScenarioError, "no heliostat"),
+        ({"transmitter": load_scenario(SHIPPED).transmitter[:4]}, GeometryError, "5 or more transmitters"),
+        ({"tone": {"frequency_hz": 1.5e6}}, GeometryError, "ambiguous.*add a tone"),
+        ({"radio": {"sample_rate_hz": 41e6}}, ScenarioError, "41000000"),
+        ({"radio": {"frame_samples": N_SAMPLE + 1}}, RecordingError, "no stretch as long as a frame of 8001"),
     ],
 )
 def test_hopeless_sites_are_refused_before_any_work(
-    tmp_path: Path, recording: Path, change: Callable[[dict[str, Any]], None], error: type[Exception], message: str
+    tmp_path: Path, recording: Path, change: dict[str, Any], error: type[Exception], message: str
 ) -> None:
     site = tmp_path / "site.toml"
-    site.write_text(_scenario(change).to_toml())
+    _scenario().changed(**change).save(site)
     with pytest.raises(error, match=message):
         process(recording, tmp_path / "result.h5", scenario=site)
     assert [path.name for path in tmp_path.iterdir()] == ["site.toml"]
