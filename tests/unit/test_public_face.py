@@ -86,6 +86,16 @@ def test_examples_in_docstrings(name: str) -> None:
     assert runner.summarize(verbose=False).failed == 0
 
 
+@pytest.mark.parametrize(("module", "name"), [
+    ("rfpose.multilat.ambiguity.least_squares", "integer_least_squares"), ("rfpose.feedback.energy", "dish_capture"),
+])  # fmt: skip
+def test_examples_of_what_only_docs_offer(module: str, name: str) -> None:
+    home = importlib.import_module(module)
+    (test,) = doctest.DocTestFinder(recurse=False).find(getattr(home, name), name, module=home, globs={})
+    assert test.examples
+    assert doctest.DocTestRunner().run(test).failed == 0
+
+
 # -- scenarios -----------------------------------------------------------------------------------------------
 
 

@@ -118,6 +118,12 @@ def dish_capture(
         As `following_h_per_deg` takes them.
     rim_rad
         Rim angle U [rad].
+
+    Examples
+    --------
+    >>> from rfpose.feedback.energy import dish_capture
+    >>> dish_capture(2000.0, h_per_deg=2.0, sigma_rad=[0.0, 0.01]).round(3).tolist()
+    [0.993, 0.743]
     """
     ratio = as_float_array("area_ratio", area_ratio, ("...",), positive=True)
     return np.asarray(-np.expm1(-_area_scale(h_per_deg, sigma_rad, rim_rad) / ratio))

@@ -13,13 +13,13 @@ from rfpose.errors import InvalidInputError
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.site import (
     Common,
+    ForeseenMirrors,
     SiteKnowledge,
     SiteObservations,
     SitePoses,
     SiteSettings,
     Voltages,
     fit_site,
-    forecast_site,
     spread_starts,
 )
 from rfpose.propagation import RayKind, Rays
@@ -228,7 +228,7 @@ def test_the_forecast_is_the_covariance_of_weighed_phases(told: complex) -> None
     known, floor, tail, noise = world.known(), 0.02, 8.0, 1e-4
     exact = SiteSettings(floor=floor, tail=tail, factor_sigma={}, soil_sigma=(0.0, 0.0))
     sigma = np.full(world.field.shape, noise)
-    found = forecast_site(sigma, np.full(len(TRANSMITTER), WAVENUMBER), known, world.foreseen, exact)
+    found = ForeseenMirrors.of(sigma, np.full(len(TRANSMITTER), WAVENUMBER), known, world.foreseen, exact).poses()
     assert (found.status == PoseStatus.OK).all()
 
     def field(m: int, w: np.ndarray) -> np.ndarray:
@@ -265,8 +265,8 @@ def test_a_forecast_without_anything_to_begin_from_says_so() -> None:
     known.commanded_rot[1] = np.nan
     sigma = np.full(world.field.shape, 1e-6)
     wavenumber = np.full(len(TRANSMITTER), WAVENUMBER)
-    found = forecast_site(sigma, wavenumber, known, world.foreseen)
+    found = ForeseenMirrors.of(sigma, wavenumber, known, world.foreseen).poses()
     assert found.status.tolist() == [PoseStatus.OK, PoseStatus.NO_POSTURE, PoseStatus.OK]
     assert np.isnan(found.normal_cov[1]).all()
-    given = forecast_site(sigma, wavenumber, known, world.foreseen, SiteSettings(floor=0.05, tail=3.0))
+    given = ForeseenMirrors.of(sigma, wavenumber, known, world.foreseen, SiteSettings(floor=0.05, tail=3.0)).poses()
     np.testing.assert_array_equal(found.cov, given.cov)

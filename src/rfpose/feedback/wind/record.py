@@ -46,11 +46,6 @@ class WindRecord:
         """Times of the samples [s]."""
         return np.asarray(self.start_unix_s + self.interval_s * np.arange(len(self.speed_mps)), np.float64)
 
-    @property
-    def known_share(self) -> float:
-        """Part of the samples that is no gap."""
-        return float(np.isfinite(self.speed_mps).mean())
-
 
 def read_wind_csv(path: Path | str, *, interval_s: float = 1.0, longest_gap_s: float = 60.0) -> WindRecord:
     """Read a wind record; see `rfpose.feedback.series.read_series_csv`.

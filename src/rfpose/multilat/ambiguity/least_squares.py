@@ -93,6 +93,16 @@ def integer_least_squares(
     InvalidInputError
         Shapes that do not fit, no candidate wanted.
 
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from rfpose.multilat.ambiguity import IntegerStatus, integer_least_squares
+    >>> found = integer_least_squares([[1.2, -0.1], [0.4, np.nan]], [0.01 * np.eye(2)] * 2)
+    >>> found.integers[0, 0].tolist()
+    [1, 0]
+    >>> [IntegerStatus(status).reason for status in found.status]
+    ['found', 'an estimate is missing']
+
     References
     ----------
     .. [1] Teunissen, The least-squares ambiguity decorrelation adjustment, J. Geodesy 70 (1995) 65–82; success

@@ -12,7 +12,7 @@ from rfpose.multilat.site.fit import (
     fit_site,
     spread_starts,
 )
-from rfpose.multilat.site.forecast import ForeseenMirrors, WorldErrors, forecast_site
+from rfpose.multilat.site.forecast import ForeseenMirrors, WorldErrors
 from rfpose.multilat.site.survey import (
     CASES,
     ReferencePoses,
@@ -40,7 +40,6 @@ __all__ = [
     "Voltages",
     "WorldErrors",
     "fit_site",
-    "forecast_site",
     "found_correlation",
     "lever_to_turn",
     "spread_starts",

@@ -35,7 +35,7 @@ from rfpose.multilat.site.fit import (
 )
 from rfpose.propagation import RayKind
 
-__all__ = ["SOURCES", "ForeseenMirrors", "WorldErrors", "forecast_site"]
+__all__ = ["SOURCES", "ForeseenMirrors", "WorldErrors"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -144,8 +144,13 @@ class ForeseenMirrors:
 
         Parameters
         ----------
-        sigma, wavenumber_radpm, knowledge, field_at, settings
-            As `forecast_site` has them.
+        sigma : (mirror, receiver, transmitter)
+            Standard deviation of the real part of each carrier, in units of the voltages.
+        wavenumber_radpm : (transmitter,)
+            2π/λ of each carrier [rad/m].
+        knowledge, field_at, settings
+            As `fit_site` has them. What nothing foresees is as strong as ``settings.floor`` says (None: 0.05 of the
+            direct field) and has Student's distribution of ``settings.tail`` (None: 3) degrees of freedom.
 
         Raises
         ------
@@ -166,7 +171,11 @@ class ForeseenMirrors:
         return replace(mirrors, common=fit.with_soil(told, some, common))
 
     def poses(self) -> SitePoses:
-        """Return what the fit would state."""
+        """Return what `fit_site` would state of mirrors that stand as commanded.
+
+        Nothing is learned but the ground's permittivity, from all these mirrors; rays' factors are as uncertain as
+        given. Poses are taken to be found: whether a second one fits alike is not asked.
+        """
         fit = self._fit(self.received())
         known, everyone, _ = known_mirrors(self.knowledge)
         # one step from the truth: residuals are zero, so that links keep the weight that they have on average
@@ -251,37 +260,6 @@ class ForeseenMirrors:
             source, "clock_sigma_m"
         )
         return replace(self, knowledge=replace(known, **{name: root * getattr(known, name)}))
-
-
-def forecast_site(
-    sigma: FloatArray,
-    wavenumber_radpm: FloatArray,
-    knowledge: SiteKnowledge,
-    field_at: FieldAt,
-    settings: SiteSettings | None = None,
-) -> SitePoses:
-    """Return what `fit_site` would state of mirrors that stand as commanded, from what they are expected to receive.
-
-    Nothing is learned but the ground's permittivity, from all these mirrors: what nothing foresees is as strong as
-    ``settings.floor`` says (None: 0.05 of the direct field) and has Student's distribution of ``settings.tail`` (None:
-    3) degrees of freedom; rays' factors are as uncertain as given. Poses are taken to be found: whether a second one
-    fits alike is not asked.
-
-    Parameters
-    ----------
-    sigma : (mirror, receiver, transmitter)
-        Standard deviation of the real part of each carrier, in units of the voltages.
-    wavenumber_radpm : (transmitter,)
-        2π/λ of each carrier [rad/m].
-    knowledge, field_at, settings
-        As `fit_site` has them.
-
-    Raises
-    ------
-    InvalidInputError
-        Arrays that do not fit each other.
-    """
-    return ForeseenMirrors.of(sigma, wavenumber_radpm, knowledge, field_at, settings).poses()
 
 
 def _turned(rot: FloatArray, turn_rad: FloatArray) -> FloatArray:

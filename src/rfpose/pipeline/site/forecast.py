@@ -43,7 +43,7 @@ def forecast_normals(
 
     Carriers are what the foreseen rays bring; their noise is that of the radio plan, by `noise_of`, for an antenna of
     the same gain in all directions: how much less a direction of low gain receives is in the carriers. For the rest see
-    `rfpose.multilat.site.forecast_site`.
+    `rfpose.multilat.site.ForeseenMirrors`.
 
     Parameters
     ----------
