@@ -30,7 +30,7 @@ class SolvedMirrors(NamedTuple):
 
 
 class HypothesisTests(NamedTuple):
-    """Statistics of hypotheses; as in `rfpose.multilat.integrity.hypotheses.Verdict`."""
+    """Statistics of hypotheses; as in `rfpose.multilat.integrity.records.Verdict`."""
 
     stat: Any
     dof: Any
