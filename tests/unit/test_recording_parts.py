@@ -385,6 +385,7 @@ def test_a_directory_of_parts(tmp_path):
     with open_recording(tmp_path) as r:
         assert r.path == tmp_path
         assert np.array_equal(r.read("r0", START, 200), x)
+        assert r.notes == []  # what is no recording is passed over
         summary = describe(r)
     assert summary["format"] == "parts"
     assert list(summary["parts"]) == ["a.h5", "b.h5"]
@@ -443,6 +444,8 @@ def test_a_manifest_names_receivers_and_offsets(tmp_path):
         ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a/b']", "`receivers` may hold letters"),
         ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a', 'a']", "`receivers` names one twice"),
         ("[[part]]\nfiles = '../a.h5'", "outside the recording's folder"),
+        ("scenario = '../site.toml'\n[[part]]\nfiles = 'a.h5'", "outside the recording's folder"),
+        ("scenarios = 5\n[[part]]\nfiles = 'a.h5'", "unknown key `scenarios`; known: format, part, scenario"),
         ("scenario = 5\n[[part]]\nfiles = 'a.h5'", "`scenario` must be the name of a file"),
         ("[[part]]\nfiles = 'nothing.h5'", "none of its no parts can be read: `nothing.h5`"),
     ],
@@ -452,9 +455,44 @@ def test_manifests_that_are_wrong(tmp_path, text, words):
     inner.mkdir()
     for folder in (tmp_path, inner):
         write(folder / "a.h5", [("rx", 0, counts(10))])
+    (tmp_path / "site.toml").write_text(SCENARIO.to_toml())
     with pytest.raises(RecordingError, match=words) as caught:
         open_recording(manifest(inner, text))
     assert "recording.toml" in str(caught.value)
+
+
+def test_paths_of_one_name_given_twice_and_within_each_other(tmp_path):
+    x = counts(300)
+    for k, folder in enumerate(("p", "q")):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "a.h5", [(f"r{k}", 0, x)])
+    (tmp_path / "q" / "deep").mkdir()
+    (tmp_path / "q" / "deep" / "s.sigmf-data").write_bytes(x.tobytes())
+    (tmp_path / "q" / "deep" / "s.sigmf-meta").write_text(
+        '{"global": {"core:datatype": "ci16_le", "core:sample_rate": 3333333.3333333335, "core:version": "1.2.0"}, '
+        '"captures": [{"core:sample_start": 0, "core:global_index": ' + str(START) + "}]}"
+    )
+    given = [tmp_path / "p" / "a.h5", tmp_path / "q"]
+    with open_recording([*given, given[0]]) as r:
+        assert r.receiver_ids == ("r0", "r1", "s")
+        assert list(describe(r)["parts"]) == [str(given[0]), str(tmp_path / "q" / "a.h5"), "deep"]
+        assert not r.doubts  # what is given twice is no overlap
+    path = manifest(tmp_path / "p", "[[part]]\nfiles = 'a.h5'\nreceivers = ['A', 'B']")
+    with open_recording(path) as r:
+        assert r.receiver_ids == ("A",)
+        assert "a.h5 has 1 receivers (r0), the manifest names 2" in r.notes
+    with pytest.raises(RecordingError, match=r"recording.toml: a manifest stands for a whole recording; give it alone"):
+        open_recording([path, tmp_path / "q"])
+    path.write_text(path.read_text().replace("rfpose-recording", "rfpose-iq"))
+    with pytest.raises(RecordingError, match="`format` must be 'rfpose-recording', got 'rfpose-iq'"):
+        open_recording(path)
+
+
+def test_times_in_a_manifest_are_as_written_and_not_the_nearest_binary_numbers(tmp_path):
+    (tmp_path / "a.iq").write_bytes(counts(10).tobytes())
+    text = '[[part]]\nfiles = "a.iq"\ntype = "raw"\nsample_type = "ci16_le"\nsample_rate_hz = 1e9\n'
+    with open_recording(manifest(tmp_path, text + "start = 1790000000.1\noffset_s = -900000000.2")) as r:
+        assert r.blocks("a").tolist() == [[889_999_999_900_000_000, 10]]
 
 
 def test_the_command_line_takes_parts(whole, tmp_path):
