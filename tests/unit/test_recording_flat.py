@@ -198,6 +198,15 @@ def test_wav_that_cannot_be_read(tmp_path, content, words):
     assert "x.wav" in str(caught.value)
 
 
+def test_wav_with_a_chunk_of_odd_length(tmp_path):
+    x = values(100).astype("<i2")
+    path = tmp_path / "x.wav"
+    path.write_bytes(wav(fmt(), chunk(b"note", b"abc"), auxi(), chunk(b"data", x.tobytes())))
+    with open_recording(path) as r:
+        ((start, count),) = r.blocks("x").tolist()
+        assert np.array_equal(r.read("x", start, count), x[:, 0])
+
+
 def test_wav_that_was_cut_is_read_to_its_end(tmp_path):
     x = values(1000).astype("<i2")
     (tmp_path / "x.wav").write_bytes(wav(fmt(), auxi(), chunk(b"data", x.tobytes()))[:-403])
@@ -246,6 +255,16 @@ def test_kiwi_over_the_end_of_the_week(tmp_path):
     with open_recording(tmp_path / name) as r:
         assert len(r.blocks("A")) == 1
         assert not r.doubts
+
+
+def test_kiwi_whose_first_stamps_are_stale_and_one_of_weeks(tmp_path):
+    x = kiwi(tmp_path / KIWI, change=lambda k, s: (255 if k < 5 else 1, s))
+    with open_recording(tmp_path / KIWI) as r:
+        assert r.blocks("DCF77").tolist() == [[START_S * 12_000, len(x)]]
+    kiwi(tmp_path / KIWI, n_buffer=4, change=lambda k, s: (1, s + k * 3 * 86_400))
+    with open_recording(tmp_path / KIWI) as r:
+        apart = np.diff(r.blocks("DCF77")[:, 0]) - 512
+        assert apart.tolist() == [3 * 86_400 * 12_000] * 3
 
 
 @pytest.mark.parametrize(

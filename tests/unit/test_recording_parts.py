@@ -2,16 +2,20 @@
 
 import contextlib
 import json
+import os
+import struct
 from fractions import Fraction
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 import rfpose as rf
-from rfpose.errors import RecordingError
-from rfpose.recording import RecordingWriter, convert, describe, open_recording
+from rfpose.errors import RecordingError, ScenarioError
+from rfpose.recording import GapError, RecordingWriter, convert, describe, open_recording
 from rfpose.scenario import load_scenario
+from rfpose.truth import Truth
 
 SCENARIO = load_scenario(Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml")
 RATE = Fraction(10**7, 3)
@@ -129,9 +133,58 @@ def test_parts_of_other_rates_and_tunings_are_refused_with_both_numbers(tmp_path
     b = write(tmp_path / "b.h5", [("r1", 0, counts(100))], sample_rate=Fraction(2_000_000))
     with pytest.raises(RecordingError, match=r"b.h5 was recorded at 2000000 samples/s, but a.h5 at 3333333.33333 \(1"):
         open_recording([a, b])
-    c = write(tmp_path / "c.h5", [("r1", 0, counts(100))], centre_frequency_hz=1.2e8)
-    with pytest.raises(RecordingError, match=r"c.h5 is tuned to 120000000 Hz, but a.h5 to 100000000 Hz"):
+    c = write(tmp_path / "c.h5", [("r0", 500, counts(100))], centre_frequency_hz=1.2e8)
+    with pytest.raises(RecordingError, match=r"`r0` is tuned to 120000000 Hz in c.h5, but to 100000000 Hz in a.h5"):
         open_recording([a, c])
+
+
+def test_receivers_that_are_tuned_apart_give_the_same_poses(tmp_path):
+    """A recorder that is tuned 200 kHz beside the others has every line 200 kHz lower, and the same phases."""
+    radio = SCENARIO.radio
+    site = SCENARIO.changed(
+        heliostat=SCENARIO.heliostat[:2], radio={"frame_samples": 8000},
+        simulation={"frame_count": 2, "sun_azimuth_deg": 170.0, "frame_interval_s": 1.0},
+    )  # fmt: skip
+    beside_hz = 200e3
+    other = site.changed(
+        radio={"frame_samples": 8000, "centre_frequency_hz": radio.centre_frequency_hz + beside_hz},
+        transmitter=[
+            {**t.model_dump(exclude_none=True), "carrier_hz": t.carrier_hz - beside_hz} for t in site.transmitter
+        ],
+    )
+    simulated, elsewhere = rf.simulate(site, seed=3), rf.simulate(other, seed=3)
+    wanted = rf.process(simulated)
+    names = list(site.receiver_ids)
+    mine = part_of(simulated, tmp_path / "a.h5", names[:3], 0, 2**62)
+    theirs = part_of(elsewhere, tmp_path / "b.h5", names[3:], 0, 2**62)
+    for given in ([mine, theirs], [theirs, mine]):
+        with open_recording(given, scenario=site) as r:
+            assert r.tuning_of(names[0]) == radio.centre_frequency_hz
+            assert r.tuning_of(names[-1]) == radio.centre_frequency_hz + beside_hz
+            assert any("sought where that puts them" in note for note in r.notes)
+            found = rf.process(r, scenario=site)
+            with pytest.raises(RecordingError, match="one file has one tuning; convert the parts apart"):
+                convert(r, tmp_path / "c.h5", format="rfpose-iq")
+        apart = np.linalg.norm(found.poses.normal_enu - wanted.poses.normal_enu, axis=-1)
+        assert np.all(apart < 5.0 * np.hypot(found.poses.sigma_rad, wanted.poses.sigma_rad))
+        assert not np.array_equal(found.poses.normal_enu, wanted.poses.normal_enu)
+    far = part_of(elsewhere, tmp_path / "d.h5", names[3:], 0, 2**62)
+    with h5py.File(far, "r+") as file:
+        file.attrs["centre_frequency_hz"] = radio.centre_frequency_hz + 1e9
+    with (
+        open_recording([mine, far], scenario=site) as r,
+        pytest.raises(ScenarioError, match=r"is tuned to 1.*Hz, but the scenario .* lies outside its band of"),
+    ):
+        rf.process(r, scenario=site)
+    split = part_of(simulated, tmp_path / "e.h5", names[:2], 0, 2**62)
+    rest = part_of(elsewhere, tmp_path / "f.h5", names[2:], 0, 2**62)
+    with (
+        open_recording([split, rest], scenario=site) as r,
+        pytest.raises(ScenarioError, match=r"receivers of heliostat `H01` are tuned apart \(`H01_r0` 100000000 Hz"),
+    ):
+        rf.process(r, scenario=site)
+    with pytest.raises(ScenarioError, match=r"tuned to .* Hz, but the scenario says `radio.centre_frequency_hz`"):
+        rf.process(theirs, scenario=site)
 
 
 def test_parts_of_two_sites_are_refused(tmp_path):
@@ -201,6 +254,115 @@ def test_parts_of_other_types_are_read_as_floats(tmp_path):
     assert np.array_equal(got[300:], z)
 
 
+def test_an_overlap_is_compared_at_both_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr("rfpose.recording.parts._COMPARED_SAMPLES", 16)
+    x = counts(1000)
+    y = x.copy()
+    y[-1] += 1
+    given = [write(tmp_path / "a.h5", [("r0", 0, x)]), write(tmp_path / "b.h5", [("r0", 0, y)])]
+    with pytest.raises(RecordingError, match="both claim to be receiver `r0` in 1000 samples"):
+        open_recording(given)
+
+
+def test_parts_may_be_given_in_any_order_and_gaps_within_one_are_its_own(tmp_path):
+    x = counts(900)
+    a = write(tmp_path / "a.h5", [("r0", 0, x[:300]), ("r0", 400, x[300:500]), ("r1", 0, counts(3000))])
+    b = write(tmp_path / "b.h5", [("r0", 600, x[500:])])
+    with open_recording([b, a]) as r:
+        assert r.blocks("r0").tolist() == [[START, 300], [START + 400, 600]]
+        assert np.array_equal(r.read("r0", START + 400, 600), x[300:])
+        assert not [line for line in describe(r)["problems"] if "missing between" in line]
+    # a receiver alone has nobody to compare with: its gaps count
+    c = write(tmp_path / "c.h5", [("r0", 0, x[:300])])
+    d = write(tmp_path / "d.h5", [("r0", 900, x[:300])])
+    with open_recording([c, d]) as r:
+        assert "600 samples (0.00018 s) are missing between c.h5 and d.h5" in r.doubts["r0"][0]
+
+
+def test_what_parts_say_of_themselves_is_told(tmp_path):
+    silent = write(tmp_path / "a.h5", [("r0", 0, counts(100))], centre_frequency_hz=None)
+    coarse = write(tmp_path / "b.h5", [("r1", 0, counts(100))], full_scale=2047)
+    with open_recording([silent, coarse]) as r:
+        assert r.centre_frequency_hz == 1e8
+        assert r.full_scale == 32767
+        assert "a.h5 does not say to what it was tuned, other parts do" in r.notes
+        assert "parts have full scales from 2047 to 32767; samples that reach 32767 count as clipped" in r.notes
+    # a WAV file that was cut, and a collection that lacks a stream
+    samples = struct.pack("<4h", 1, 2, 3, 4)
+    form = struct.pack("<HHIIHH", 1, 2, 1000, 4000, 4, 16)
+    wav = b"RIFF\0\0\0\0WAVEfmt " + struct.pack("<I", 16) + form + b"data" + struct.pack("<I", 100) + samples
+    (tmp_path / "c.wav").write_bytes(wav)
+    (tmp_path / "d.sigmf-data").write_bytes(samples)
+    (tmp_path / "d.sigmf-meta").write_text(
+        '{"global": {"core:datatype": "ci16_le", "core:sample_rate": 1000, "core:version": "1.2.0"}, "captures": '
+        '[{"core:sample_start": 0, "core:datetime": "2026-09-21T14:13:20.000Z"}], "annotations": []}'
+    )
+    (tmp_path / "d.sigmf-collection").write_text(
+        '{"collection": {"core:version": "1.2.0", "core:streams": ["d", "gone"]}}'
+    )
+    wav_part = '[[part]]\nfiles = "c.wav"\n'
+    text = '[[part]]\nfiles = "d.sigmf-collection"\n' + wav_part
+    with open_recording(manifest(tmp_path, text)) as r:
+        assert r.receiver_ids == ("d",)
+        assert any("c.wav: when it was recorded is not known; say so with `start`" in note for note in r.notes)
+        assert any("d.sigmf-collection: `d.sigmf-collection` names `gone.sigmf-meta`" in note for note in r.notes)
+    with open_recording(manifest(tmp_path, text + 'start = "2026-09-21T14:13:20.5Z"')) as r:
+        assert r.blocks("c").tolist() == [[1_790_000_000_500, 2]]
+        assert any("92 of its bytes are missing" in doubt and "(c.wav)" in doubt for doubt in r.doubts["c"])
+    (tmp_path / "e.iq").write_bytes(samples)
+    declared = 'type = "raw"\nsample_type = "ci16_le"\nsample_rate_hz = 1000\nstart = 5\noffset_s = -6'
+    with pytest.raises(RecordingError, match=r"e.iq would begin before 1970; correct its offset"):
+        open_recording(manifest(tmp_path, f'[[part]]\nfiles = "e.iq"\n{declared}'))
+
+
+def truth_of(starts, turn=0.0, clock_ppm=1.0):
+    normal = np.tile([np.sin(turn), 0.0, np.cos(turn)], (len(starts), 1, 1))
+    return Truth(
+        heliostat_ids=("H01",), receiver_ids=("r0",), transmitter_ids=("T1",), normal_enu=normal,
+        receiver_enu_m=normal.copy(), frame_start_index=np.array(starts), clock_ppm=np.array([clock_ppm]),
+    )  # fmt: skip
+
+
+def test_truths_of_parts_that_follow_each_other_are_joined(tmp_path):
+    def part(name, start, truth):
+        with RecordingWriter(
+            tmp_path / name, receiver_ids=["r0"], scenario=None, sample_rate=RATE, centre_frequency_hz=1e8,
+            sample_format="int16", full_scale=32767, provenance={},
+        ) as writer:  # fmt: skip
+            writer.write("r0", START + start, counts(100))
+            writer.write_truth(truth)
+        return tmp_path / name
+
+    a = part("a.h5", 0, truth_of([START, START + 50]))
+    b = part("b.h5", 200, truth_of([START + 200], turn=0.3))
+    with open_recording([b, a]) as r:
+        assert r.truth.frame_start_index.tolist() == [START, START + 50, START + 200]
+        assert r.truth.normal_enu[:, 0, 0] == pytest.approx([0.0, 0.0, np.sin(0.3)])
+        assert r.truth.clock_ppm.tolist() == [1.0]
+    for name, truth, words in (
+        ("c.h5", truth_of([START + 20], turn=0.3), "they overlap in time"),
+        ("d.h5", truth_of([START + 200], clock_ppm=2.0), "`clock_ppm` differ"),
+    ):
+        with open_recording([a, part(name, 200, truth)]) as r:
+            assert r.truth is None
+            assert any(f"do not fit together ({words}) and are left out" in note for note in r.notes)
+
+
+def test_a_part_that_is_damaged_while_it_is_read_is_a_gap(tmp_path):
+    text = ""
+    for name in ("r0", "r1"):
+        (tmp_path / f"{name}.iq").write_bytes(counts(100).tobytes())
+        text += f'[[part]]\nfiles = "{name}.iq"\ntype = "raw"\nsample_type = "ci16_le"\nsample_rate_hz = 1000\n'
+        text += f'start = 1790000000\nreceivers = ["{name}"]\n'
+    with open_recording(manifest(tmp_path, text)) as r:
+        os.truncate(tmp_path / "r0.iq", 100)
+        for _ in range(2):
+            with pytest.raises(GapError, match=r"r0\.iq: the file became shorter"):
+                r.read("r0", 1_790_000_000_000, 100)
+        assert np.array_equal(r.read("r1", 1_790_000_000_000, 100), counts(100))
+        assert [note for note in r.notes if "r0.iq is damaged" in note] == [r.notes[-1]]
+
+
 def test_more_parts_than_may_be_open(tmp_path, monkeypatch):
     monkeypatch.setattr("rfpose.recording.parts._OPEN_PARTS", 2)
     x = counts(500)
@@ -223,6 +385,7 @@ def test_a_directory_of_parts(tmp_path):
     with open_recording(tmp_path) as r:
         assert r.path == tmp_path
         assert np.array_equal(r.read("r0", START, 200), x)
+        assert r.notes == []  # what is no recording is passed over
         summary = describe(r)
     assert summary["format"] == "parts"
     assert list(summary["parts"]) == ["a.h5", "b.h5"]
@@ -281,6 +444,8 @@ def test_a_manifest_names_receivers_and_offsets(tmp_path):
         ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a/b']", "`receivers` may hold letters"),
         ("[[part]]\nfiles = 'a.h5'\nreceivers = ['a', 'a']", "`receivers` names one twice"),
         ("[[part]]\nfiles = '../a.h5'", "outside the recording's folder"),
+        ("scenario = '../site.toml'\n[[part]]\nfiles = 'a.h5'", "outside the recording's folder"),
+        ("scenarios = 5\n[[part]]\nfiles = 'a.h5'", "unknown key `scenarios`; known: format, part, scenario"),
         ("scenario = 5\n[[part]]\nfiles = 'a.h5'", "`scenario` must be the name of a file"),
         ("[[part]]\nfiles = 'nothing.h5'", "none of its no parts can be read: `nothing.h5`"),
     ],
@@ -290,9 +455,44 @@ def test_manifests_that_are_wrong(tmp_path, text, words):
     inner.mkdir()
     for folder in (tmp_path, inner):
         write(folder / "a.h5", [("rx", 0, counts(10))])
+    (tmp_path / "site.toml").write_text(SCENARIO.to_toml())
     with pytest.raises(RecordingError, match=words) as caught:
         open_recording(manifest(inner, text))
     assert "recording.toml" in str(caught.value)
+
+
+def test_paths_of_one_name_given_twice_and_within_each_other(tmp_path):
+    x = counts(300)
+    for k, folder in enumerate(("p", "q")):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "a.h5", [(f"r{k}", 0, x)])
+    (tmp_path / "q" / "deep").mkdir()
+    (tmp_path / "q" / "deep" / "s.sigmf-data").write_bytes(x.tobytes())
+    (tmp_path / "q" / "deep" / "s.sigmf-meta").write_text(
+        '{"global": {"core:datatype": "ci16_le", "core:sample_rate": 3333333.3333333335, "core:version": "1.2.0"}, '
+        '"captures": [{"core:sample_start": 0, "core:global_index": ' + str(START) + "}]}"
+    )
+    given = [tmp_path / "p" / "a.h5", tmp_path / "q"]
+    with open_recording([*given, given[0]]) as r:
+        assert r.receiver_ids == ("r0", "r1", "s")
+        assert list(describe(r)["parts"]) == [str(given[0]), str(tmp_path / "q" / "a.h5"), "deep"]
+        assert not r.doubts  # what is given twice is no overlap
+    path = manifest(tmp_path / "p", "[[part]]\nfiles = 'a.h5'\nreceivers = ['A', 'B']")
+    with open_recording(path) as r:
+        assert r.receiver_ids == ("A",)
+        assert "a.h5 has 1 receivers (r0), the manifest names 2" in r.notes
+    with pytest.raises(RecordingError, match=r"recording.toml: a manifest stands for a whole recording; give it alone"):
+        open_recording([path, tmp_path / "q"])
+    path.write_text(path.read_text().replace("rfpose-recording", "rfpose-iq"))
+    with pytest.raises(RecordingError, match="`format` must be 'rfpose-recording', got 'rfpose-iq'"):
+        open_recording(path)
+
+
+def test_times_in_a_manifest_are_as_written_and_not_the_nearest_binary_numbers(tmp_path):
+    (tmp_path / "a.iq").write_bytes(counts(10).tobytes())
+    text = '[[part]]\nfiles = "a.iq"\ntype = "raw"\nsample_type = "ci16_le"\nsample_rate_hz = 1e9\n'
+    with open_recording(manifest(tmp_path, text + "start = 1790000000.1\noffset_s = -900000000.2")) as r:
+        assert r.blocks("a").tolist() == [[889_999_999_900_000_000, 10]]
 
 
 def test_the_command_line_takes_parts(whole, tmp_path):

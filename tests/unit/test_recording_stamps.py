@@ -66,6 +66,16 @@ def test_stamps_that_scatter_make_no_gaps_but_are_told():
     assert "scatter by" in found.doubts[-1]
 
 
+def test_stamps_that_scatter_by_tenths_of_a_second_tell_no_time():
+    jitter = np.random.default_rng(4).normal(0, 0.4, 40)
+    jitter[0] = 0.0
+    n = [k * 10**6 for k in range(40)]
+    # an index places the samples; what the stamps say is refused all the same
+    stamped = captures(n, [START + k for k in n], jitter_s=jitter)
+    with pytest.raises(InvalidInputError, match=r"scatter by .* they tell no time; correct or remove them"):
+        place_captures([Capture(c.first_sample, c.stamp, START + c.first_sample) for c in stamped], RATE)
+
+
 def test_one_late_stamp_among_many_is_no_gap():
     jitter = [0.0] * 10
     jitter[4] = 0.3e-3

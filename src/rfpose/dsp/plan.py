@@ -90,14 +90,21 @@ class LinePlan:
         )
 
     @classmethod
-    def from_scenario(cls, scenario: Scenario) -> LinePlan:
-        """Return the plan of a scenario."""
+    def from_scenario(cls, scenario: Scenario, *, tuned_hz: float | None = None) -> LinePlan:
+        """Return the plan of a scenario for a receiver tuned to ``tuned_hz``; None: to what the scenario says.
+
+        Raises
+        ------
+        InvalidInputError
+            A line lies outside the band of a receiver that is tuned so.
+        """
         radio = scenario.radio
+        tuned = radio.centre_frequency_hz if tuned_hz is None else tuned_hz
         return cls.create(
-            scenario.carrier_hz,
+            scenario.carrier_hz + (radio.centre_frequency_hz - tuned),
             scenario.tone_hz,
             sample_rate_hz=radio.sample_rate_hz,
-            centre_frequency_hz=radio.centre_frequency_hz,
+            centre_frequency_hz=tuned,
             clock_search_ppm=radio.clock_search_ppm,
         )
 

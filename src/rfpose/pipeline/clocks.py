@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 
 from rfpose.checks import FloatArray
-from rfpose.dsp import LinePlan, ToneExtractor
 from rfpose.errors import RecordingError
+from rfpose.pipeline.measure import extractors
 from rfpose.recording import GapError
 from rfpose.recording.base import IndexArray, merge_rows
 from rfpose.recording.parts import PartsRecording
@@ -183,7 +183,7 @@ class _Comparison:
     def __init__(self, recording: PartsRecording, scenario: Scenario) -> None:
         self._recording = recording
         self._n_sample = scenario.radio.frame_samples
-        self._extractor = ToneExtractor(LinePlan.from_scenario(scenario), full_scale=recording.full_scale)
+        self._extractor_of = extractors(recording, scenario)
         self._heard: dict[tuple[str, int], tuple[FloatArray, FloatArray] | None] = {}
         self._known = set(scenario.receiver_ids)
         self._wanders = functools.cache(self._changes_enough)
@@ -256,7 +256,7 @@ class _Comparison:
         key = name, start
         if key not in self._heard:
             try:
-                tones = self._extractor.measure(self._recording.read(name, start, self._n_sample))
+                tones = self._extractor_of(name).measure(self._recording.read(name, start, self._n_sample))
             except GapError:
                 tones = None
             heard = None if tones is None else (tones.phase_rad.ravel(), tones.sigma_rad.ravel())

@@ -23,7 +23,7 @@ from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import GapError, Recording, open_recording
 from rfpose.scenario import Scenario
 
-__all__ = ["JOURNAL_SAMPLES", "OtherProcesses", "journal_key", "measure_tones"]
+__all__ = ["JOURNAL_SAMPLES", "OtherProcesses", "extractors", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
 """Samples measured here between two entries of the journal, and by each thread elsewhere: about a second's work."""
@@ -50,7 +50,13 @@ def journal_key(recording: Recording, scenario: Scenario, estimator: str) -> dic
 
 def _fingerprint(recording: Recording) -> str:
     """Hash a recording's shape and some of its samples, so that another recording of the same shape differs."""
-    facts = [recording.receiver_ids, str(recording.sample_rate), recording.sample_format, str(recording.full_scale)]
+    facts = [
+        recording.receiver_ids,
+        str(recording.sample_rate),
+        recording.sample_format,
+        str(recording.full_scale),
+        [recording.centre_frequency_hz, recording.tunings],
+    ]
     found = hashlib.sha256(json.dumps(facts).encode())
     for receiver_id in recording.receiver_ids:
         blocks = recording.blocks(receiver_id)
@@ -161,6 +167,25 @@ def measure_tones(
     return tones
 
 
+def extractors(recording: Recording, scenario: Scenario, estimator: str = "hilbert") -> Callable[[str], ToneExtractor]:
+    """Return what measures a receiver's tones, by its name: receivers tuned apart have their lines elsewhere."""
+
+    def made(tuned_hz: float | None) -> ToneExtractor:
+        plan = LinePlan.from_scenario(scenario, tuned_hz=tuned_hz)
+        return ToneExtractor(plan, estimator, full_scale=recording.full_scale)
+
+    as_told = made(None)
+    others = {tuned: made(tuned) for name in recording.tunings if (tuned := recording.tuning_of(name)) is not None}
+    if recording.tunings and (first := recording.centre_frequency_hz) is not None:
+        others[first] = made(first)
+
+    def of(receiver_id: str) -> ToneExtractor:
+        tuned = recording.tuning_of(receiver_id)
+        return as_told if tuned is None else others.get(tuned, as_told)
+
+    return of
+
+
 def _rows(tones: TonePhases) -> Entry:
     """Return views of the arrays with frame and receiver in one axis."""
     arrays = {name: getattr(tones, name) for name in FrameTones.__dataclass_fields__}
@@ -244,8 +269,7 @@ class _Bench:
         self.recipe = recipe
         self._receiver_ids = recipe.scenario.receiver_ids
         self._n_sample = recipe.scenario.radio.frame_samples
-        plan = LinePlan.from_scenario(recipe.scenario)
-        self._extractor = ToneExtractor(plan, recipe.estimator, full_scale=recording.full_scale)
+        self._extractor_of = extractors(recording, recipe.scenario, recipe.estimator)
         self._lock = threading.Lock()  # not every format's library can be called from several threads at once
         self._own = threading.local()
 
@@ -266,15 +290,16 @@ class _Bench:
                 with stages.during("read"):
                     samples = self._read(row)
                 with stages.during("tones", 0 if isinstance(samples, LineStatus) else len(samples)):
-                    found = self._found(samples, float(clock_ppm[k]))
+                    found = self._found(int(i_receiver), samples, float(clock_ppm[k]))
                 rows.append((row, found))
                 clock_ppm[k] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
         return _Measured(rows, clock_ppm, stages.seconds, stages.samples)
 
-    def _found(self, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
+    def _found(self, i_receiver: int, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
+        extractor = self._extractor_of(self._receiver_ids[i_receiver])
         if isinstance(samples, LineStatus):
-            return FrameTones.failed(self._extractor.plan.n_transmitter, self._extractor.plan.n_tone, samples)
-        return self._extractor.measure(samples, clock_ppm=clock_ppm)
+            return FrameTones.failed(extractor.plan.n_transmitter, extractor.plan.n_tone, samples)
+        return extractor.measure(samples, clock_ppm=clock_ppm)
 
     def _read(self, row: int) -> Samples | LineStatus:
         """Return one receiver's samples in one frame, or why there are none."""

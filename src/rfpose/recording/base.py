@@ -108,6 +108,8 @@ class Recording(ABC):
         Exact rate [1/s].
     centre_frequency_hz
         Radio frequency at baseband zero [Hz]; None when the file does not say.
+    tunings
+        Radio frequency at baseband zero of receivers that are tuned otherwise, by their names [Hz]; see `tuning_of`.
     sample_format
         ``"int16"`` (`read` gives int16 counts) or ``"complex64"`` (`read` gives float32).
     full_scale
@@ -148,6 +150,7 @@ class Recording(ABC):
         self.receiver_ids = receiver_ids
         self.sample_rate = sample_rate
         self.centre_frequency_hz = centre_frequency_hz
+        self.tunings: dict[str, float] = {}
         self.sample_format: SampleFormat = sample_format
         self.full_scale = full_scale
         self.scenario = scenario
@@ -288,6 +291,10 @@ class Recording(ABC):
         if receiver_id not in self._blocks:
             self._blocks[receiver_id] = read_only(merge_rows(self._segments_of(receiver_id)))
         return self._blocks[receiver_id]
+
+    def tuning_of(self, receiver_id: str) -> float | None:
+        """Return the radio frequency at baseband zero of a receiver [Hz]; None when the file does not say."""
+        return self.tunings.get(receiver_id, self.centre_frequency_hz)
 
     def covers(self, receiver_id: str, start_index: int, count: int) -> bool:
         """Tell whether a receiver recorded all of ``count`` samples from ``start_index`` on."""

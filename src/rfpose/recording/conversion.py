@@ -79,12 +79,13 @@ def convert(
         Unknown ``format`` or ``compress``, or a format that knows no compression.
     RecordingError
         The target exists, is or holds what is read, or cannot be written; the format's library is missing; the source
-        is damaged; what was written reads back as something else.
+        is damaged, or its receivers are tuned apart; what was written reads back as something else.
     """
     if format not in get_args(WrittenFormat):
         raise InvalidInputError(f"`format` must be one of {', '.join(get_args(WrittenFormat))}, got {format!r}")
     if compress is not None and format != "rfpose-iq":
         raise InvalidInputError(f"`compress` is for rfpose-iq, {format} has no place for it")
+    _refuse_tunings(source)
     target = Path(target_path)
     digests = _Digests()
     inputs = source.files()
@@ -167,6 +168,15 @@ def _refuse_small_disk(source: Recording, target: Path) -> None:
         raise RecordingError(
             f"{target}: needs {n_byte / 1e9:.3g} GB, the disk has {free / 1e9:.3g} GB free; free space on it, or write "
             "elsewhere"
+        )
+
+
+def _refuse_tunings(source: Recording) -> None:
+    """No format that is written can say of receivers that they are tuned apart."""
+    for name, tuned in source.tunings.items():
+        raise RecordingError(
+            f"{source.path}: receiver `{name}` is tuned to {tuned:.12g} Hz, others to "
+            f"{source.centre_frequency_hz:.12g} Hz, and one file has one tuning; convert the parts apart"
         )
 
 

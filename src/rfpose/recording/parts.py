@@ -88,8 +88,9 @@ class _Known:
 class PartsRecording(Recording):
     """Many recordings that are read as one. Open it through `open_recording`.
 
-    Parts have one sample rate, one tuning and one site, or are refused. A part that is missing or damaged is left out
-    and named in `notes`. Where parts overlap in a receiver they must hold the same samples.
+    Parts have one sample rate and one site, or are refused, as is a receiver that is tuned otherwise in one part than
+    in another; receivers may be tuned apart. A part that is missing or damaged is left out and named in `notes`. Where
+    parts overlap in a receiver they must hold the same samples.
 
     Parameters
     ----------
@@ -145,6 +146,7 @@ class PartsRecording(Recording):
             )
             self.names = tuple(names)
             self.notes = notes
+            self._tell_tunings()
             self._tell_doubts()
             self._stretches = {name: self._laid_out(name) for name in self.receiver_ids}
             self._tell_gaps()
@@ -219,9 +221,8 @@ class PartsRecording(Recording):
         return {own: name for own, name in part.receivers.items() if own in recording.receiver_ids}
 
     def _refuse_unlike(self, path: Path) -> None:
-        """Raise if parts differ in rate or tuning; both numbers are named."""
+        """Raise if parts differ in rate, or in the tuning of a receiver; both numbers are named."""
         first = self._known[0]
-        tuned = next((known for known in self._known if known.recording.centre_frequency_hz is not None), first)
         for known in self._known:
             mine, theirs = known.recording.sample_rate, first.recording.sample_rate
             if mine != theirs:
@@ -229,12 +230,18 @@ class PartsRecording(Recording):
                     f"{path}: {known.part.name} was recorded at {_number(mine)} samples/s, but {first.part.name} at "
                     f"{_number(theirs)}; process them apart"
                 )
-            frequency, wanted = known.recording.centre_frequency_hz, tuned.recording.centre_frequency_hz
-            if frequency is not None and frequency != wanted:
-                raise RecordingError(
-                    f"{path}: {known.part.name} is tuned to {frequency:.12g} Hz, but {tuned.part.name} to "
-                    f"{wanted:.12g} Hz; process them apart"
-                )
+        tuned: dict[str, tuple[float, str]] = {}
+        for known in self._known:
+            frequency = known.recording.centre_frequency_hz
+            if frequency is None:
+                continue
+            for name in known.blocks:
+                wanted, where = tuned.setdefault(name, (frequency, known.part.name))
+                if frequency != wanted:
+                    raise RecordingError(
+                        f"{path}: receiver `{name}` is tuned to {frequency:.12g} Hz in {known.part.name}, but to "
+                        f"{wanted:.12g} Hz in {where}; process them apart"
+                    )
 
     def _one_site(self, path: Path) -> Scenario | None:
         """Return the site that the parts bring along; two are refused."""
@@ -251,6 +258,19 @@ class PartsRecording(Recording):
                     "give the one that holds as `scenario=FILE`, or process them apart"
                 )
         return None if found is None else found[1]
+
+    def _tell_tunings(self) -> None:
+        """Keep and tell which receivers are tuned otherwise than the first part that says it."""
+        wanted = self.centre_frequency_hz
+        for known in self._known:
+            frequency = known.recording.centre_frequency_hz
+            if frequency is None or wanted is None or frequency == wanted:
+                continue
+            self.tunings |= dict.fromkeys(known.blocks, frequency)
+            self.notes.append(
+                f"{known.part.name} is tuned to {frequency:.12g} Hz, other parts to {wanted:.12g} Hz: lines of its "
+                "receivers are sought where that puts them"
+            )
 
     def _tell_doubts(self) -> None:
         """Gather what the parts doubt, under the names that receivers have in the whole."""

@@ -46,7 +46,9 @@ def draw_spectrum(recording: Recording, *, scenario: Scenario | None = None, rec
     frequency_hz, power_db = _spectrum(recording, scenario, receiver_id)
     figure, axes = new_figure(11.0, 5.2)
     axes.plot(1e-6 * frequency_hz, power_db, color="0.35", lw=0.6)
-    line_mhz = 1e-6 * scenario.line_hz
+    tuned_hz = recording.tuning_of(receiver_id) if recording.tunings else scenario.radio.centre_frequency_hz
+    tuned_hz = scenario.radio.centre_frequency_hz if tuned_hz is None else tuned_hz
+    line_mhz = 1e-6 * (scenario.line_hz + (scenario.radio.centre_frequency_hz - tuned_hz))
     level_db = np.interp(line_mhz, 1e-6 * frequency_hz, _widened(power_db))
     axes.plot(line_mhz[:, 0], level_db[:, 0] + 2.0, "v", color="#0072B2", ms=6, label="carrier")
     axes.plot(
@@ -54,7 +56,7 @@ def draw_spectrum(recording: Recording, *, scenario: Scenario | None = None, rec
     )
     for name, x, y in zip(scenario.transmitter_ids, line_mhz[:, 0], level_db[:, 0], strict=True):
         axes.annotate(name, (x, y + 2.0), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-    axes.set_xlabel(f"frequency from {1e-6 * scenario.radio.centre_frequency_hz:g} MHz [MHz]")
+    axes.set_xlabel(f"frequency from {1e-6 * tuned_hz:g} MHz [MHz]")
     full_scale = np.isfinite(recording.full_scale)
     axes.set_ylabel("power in one bin [dB of full scale]" if full_scale else "power in one bin [dB]")
     axes.set_xlim(1e-6 * frequency_hz[0], 1e-6 * frequency_hz[-1])

@@ -53,15 +53,47 @@ def _disagreements(recording: Recording, scenario: Scenario) -> list[str]:
             f"recorded at {float(recording.sample_rate):.12g} samples/s, but the scenario says "
             f"`radio.sample_rate_hz` = {scenario.radio.sample_rate_hz:.12g}"
         )
-    tuned, wanted = recording.centre_frequency_hz, scenario.radio.centre_frequency_hz
-    if tuned is not None and abs(tuned - wanted) > max(1e-3, _RATE_TOLERANCE * abs(wanted)):
-        found.append(f"tuned to {tuned:.12g} Hz, but the scenario says `radio.centre_frequency_hz` = {wanted:.12g}")
+    found += _untuned(recording, scenario)
     if not set(recording.receiver_ids) & set(scenario.receiver_ids):
         found.append(
             f"holds receivers {_some(recording.receiver_ids)}, but the scenario names {_some(scenario.receiver_ids)}: "
             "none in common"
         )
     return found
+
+
+def _untuned(recording: Recording, scenario: Scenario) -> list[str]:
+    """Tell what tunings do not fit: none is as told, those of a mirror differ, a line is outside a band."""
+    wanted = scenario.radio.centre_frequency_hz
+    others = {}
+    for name in recording.receiver_ids:
+        tuned = recording.tuning_of(name)
+        if tuned is not None and abs(tuned - wanted) > max(1e-3, _RATE_TOLERANCE * abs(wanted)):
+            others[name] = tuned
+    if not others:
+        return []
+    said = f"but the scenario says `radio.centre_frequency_hz` = {wanted:.12g}"
+    if len(others) == len(recording.receiver_ids):
+        return [f"tuned to {next(iter(others.values())):.12g} Hz, {said}"]
+    for mirror in scenario.heliostat:
+        there = [name for name in mirror.receiver_ids if name in recording.receiver_ids]
+        recorded = {name: tuned for name in there if (tuned := recording.tuning_of(name)) is not None}
+        if len(set(recorded.values())) > 1:
+            shown = ", ".join(f"`{name}` {tuned:.12g} Hz" for name, tuned in recorded.items())
+            return [
+                f"the receivers of heliostat `{mirror.id}` are tuned apart ({shown}), and their carriers can be "
+                "compared only from one oscillator"
+            ]
+    half = float(recording.sample_rate) / 2.0
+    for name, tuned in others.items():
+        line_hz = wanted + np.ravel(scenario.line_hz)
+        furthest = float(line_hz[np.argmax(np.abs(line_hz - tuned))])
+        if abs(furthest - tuned) >= half:
+            return [
+                f"receiver `{name}` is tuned to {tuned:.12g} Hz, {said}, and the line at {furthest:.12g} Hz lies "
+                f"outside its band of {half:.12g} Hz to each side"
+            ]
+    return []
 
 
 def note_doubts(recording: Recording) -> None:

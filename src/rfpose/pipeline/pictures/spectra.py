@@ -192,6 +192,7 @@ class SharedRecording(Recording):
             truth=inner.truth,
             provenance=inner.provenance,
         )
+        self.tunings = inner.tunings
         self.doubts = inner.doubts
         self.time_known = inner.time_known
         self._inner = inner
