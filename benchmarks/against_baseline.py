@@ -31,18 +31,24 @@ ROOT = Path(__file__).resolve().parents[1]
 BASELINE = "3d4d5e2"
 TREES = ("old", "new")
 SITE, DAY = "data/table2_100m.toml", "data/tracking_100m.toml"
+PAINT = ROOT.parent / "shared/data/paint"  # real records, which are no part of the repository
 JOBS: Mapping[str, tuple[str, ...]] = {
     "process": ("process", "{recording}", "-o", "{out}.h5", "--force"),
     "evaluate": ("evaluate", "{result}"),
     "info of a recording": ("info", "{recording}"),
     "layout map": ("layout", "map", "{site}"),
+    "layout optimise": ("layout", "optimise", "{site}", "-o", "{out}.toml", "--force"),
+    "calibrate": ("calibrate", "{paint}", "--heliostat", "BF57"),
     "track --help": ("track", "--help"),
     "track": ("track", "{day}", "-o", "{out}.h5", "--methods", "radio", "--force"),
+    "track 1000 mirrors": (
+        "track", "{day}", "-o", "{out}.h5", "--methods", "radio", "--heliostats", "1000", "--force",
+    ),
     "view --save of a recording": ("view", "{recording}", "--save", "{out}.png", "--force"),
     "view --save of a result": ("view", "{result}", "--save", "{out}.png", "--force"),
     "view --save of a layout": ("view", "{site}", "--save", "{out}.png", "--force"),
     "a refusal": ("evaluate", "{site}"),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -83,7 +89,7 @@ def run(tree: Path, words: tuple[str, ...], *, folder: Path, cache: Path | None 
 def files(old: Path, folder: Path) -> dict[str, str]:
     """Have the older tree write what the jobs read."""
     names = {name: str(folder / f"{name}.h5") for name in ("recording", "result")}
-    names |= {"site": str(old / SITE), "day": str(old / DAY)}
+    names |= {"site": str(old / SITE), "day": str(old / DAY), "paint": str(PAINT)}
     run(old, ("simulate", names["site"], "-o", names["recording"]), folder=folder)
     run(old, ("process", names["recording"], "-o", names["result"]), folder=folder)
     return names
@@ -111,6 +117,9 @@ def main() -> None:
         names = files(trees["old"], folder)
         console = Console(stderr=True)
         for job in args.only:
+            if job == "calibrate" and not PAINT.is_dir():
+                console.print(f"{job}: left out, since {PAINT} is not there")
+                continue
             words = tuple(word.format(**names, out=folder / "out") for word in JOBS[job])
             console.print(f"{job} …")
             for tree in TREES:  # the caches are filled

@@ -29,6 +29,7 @@ __all__ = [
     "kernel",
     "kernel_fast",
     "kernel_inline",
+    "kernel_lean",
     "kernel_parallel",
     "kernel_rows",
     "load_numba",
@@ -53,6 +54,14 @@ def kernel(function: Function) -> Kernel:
 def kernel_inline(function: Function) -> Kernel:
     """Compile a small piece that is inlined into the kernels that call it."""
     return Kernel(function, inline="always")
+
+
+def kernel_lean(function: Function) -> Kernel:
+    """Compile a serial kernel that makes no arrays, only looks into those handed in.
+
+    It does not count who holds them: threads that work on rows of one array would wait for each other's counting.
+    """
+    return Kernel(function, _nrt=False)
 
 
 def kernel_parallel(function: Function) -> Kernel:

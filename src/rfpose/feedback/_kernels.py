@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from rfpose.feedback.columns import MEASUREMENT, K, M, P
-from rfpose.jit import kernel, kernel_parallel, prange
+from rfpose.jit import kernel, kernel_lean, kernel_rows
 from rfpose.multilat.equations._kernels import factor, solve_factored
 
 N_ROW = sum(MEASUREMENT.values())
@@ -20,9 +20,10 @@ N_PREPARED = 22
 # Median of a Rayleigh variable in units of its sigma: the residual has two components.
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
+_STEEP = 1.2  # an elevation that is safely on this side of the zenith [rad]
 
 
-@kernel
+@kernel_lean
 def _opening(length, radius, offset):
     """Angle between the two sides of a linear actuator's triangle; NaN where it does not close."""
     cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
@@ -31,7 +32,7 @@ def _opening(length, radius, offset):
     return math.acos(cosine)
 
 
-@kernel
+@kernel_lean
 def prepare(p, k, out):
     """Prepare what does not depend on the posture."""
     cn, sn = math.cos(p[P.pedestal_tilt_north_rad]), math.sin(p[P.pedestal_tilt_north_rad])
@@ -63,7 +64,7 @@ def prepare(p, k, out):
         out[at], out[at + 1], out[at + 2] = across * inverse, along * inverse, inverse
 
 
-@kernel
+@kernel_lean
 def axis_angle(a, count, p, k, prepared):
     """Angle of axis ``a`` at a motor position."""
     travel = count / k[K.counts_per_unit + a] * (1.0 + p[P.axis_1_gain + a])
@@ -80,14 +81,14 @@ def axis_angle(a, count, p, k, prepared):
     return angle
 
 
-@kernel
+@kernel_lean
 def posture(azimuth, elevation, p, prepared, receiver, out):
     """Mirror normal (3) and centre (3) in ENU at two axis angles."""
     sa, ca = math.sin(azimuth), math.cos(azimuth)
     _pose(sa, ca, math.sin(elevation), math.cos(elevation), p, prepared, receiver, out)
 
 
-@kernel
+@kernel_lean
 def _pose(sa, ca, se, ce, p, prepared, receiver, out):
     """The same at sines and cosines of the axis angles."""
     sd, cd = prepared[OBLIQUE], prepared[OBLIQUE + 1]
@@ -115,13 +116,13 @@ def _pose(sa, ca, se, ce, p, prepared, receiver, out):
         out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
 
 
-@kernel
+@kernel_lean
 def stand(count_1, count_2, p, k, prepared, receiver, out):
     """Mirror normal and centre at two motor positions."""
     posture(axis_angle(0, count_1, p, k, prepared), axis_angle(1, count_2, p, k, prepared), p, prepared, receiver, out)
 
 
-@kernel
+@kernel_lean
 def bisector(m, centre, out):
     """Normal that sends the row's source to its target from a mirror centre."""
     from_point, to_point = m[M.source_is_point], m[M.target_is_point]
@@ -164,20 +165,29 @@ def _residuals(p, k, count, row, use, out):
             out[i, j] = (state[j] - wanted[j]) / row[i, M.sigma_rad]
 
 
-@kernel_parallel
 def residuals_batch(p, k, count, row, use):
     """Residuals of many heliostats (heliostat, measurement, xyz), in sigma."""
     out = np.empty((len(p), row.shape[1], 3))
-    for h in prange(len(p)):
-        _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
+    _residuals_rows(len(p), p, k, count, row, use, out)
     return out
 
 
-@kernel_parallel
+@kernel_rows
+def _residuals_rows(begin, end, p, k, count, row, use, out):
+    for h in range(begin, end):
+        _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
+
+
 def jacobian_batch(p, k, count, row, use, free, scale):
     """Central differences of the residuals by free parameters, (heliostat, measurement, xyz, parameter)."""
     out = np.empty((len(p), row.shape[1], 3, len(free)))
-    for h in prange(len(p)):
+    _jacobian_rows(len(p), p, k, count, row, use, free, scale, out)
+    return out
+
+
+@kernel_rows
+def _jacobian_rows(begin, end, p, k, count, row, use, free, scale, out):
+    for h in range(begin, end):
         trial = p[h].copy()
         high = np.empty((row.shape[1], 3))
         low = np.empty((row.shape[1], 3))
@@ -191,24 +201,27 @@ def jacobian_batch(p, k, count, row, use, free, scale):
             for i in range(row.shape[1]):
                 for j in range(3):
                     out[h, i, j, f] = (high[i, j] - low[i, j]) / (2.0 * step)
-    return out
 
 
-@kernel_parallel
 def posture_batch(p, k, count, receiver):
     """Axis angles, normal and centre (heliostat, posture, 8)."""
     out = np.empty((len(p), count.shape[1], 8))
-    for h in prange(len(p)):
+    _posture_rows(len(p), p, k, count, receiver, out)
+    return out
+
+
+@kernel_rows
+def _posture_rows(begin, end, p, k, count, receiver, out):
+    for h in range(begin, end):
         prepared = np.empty(N_PREPARED)
         prepare(p[h], k[h], prepared)
         for i in range(count.shape[1]):
             out[h, i, 0] = axis_angle(0, count[h, i, 0], p[h], k[h], prepared)
             out[h, i, 1] = axis_angle(1, count[h, i, 1], p[h], k[h], prepared)
             posture(out[h, i, 0], out[h, i, 1], p[h], prepared, receiver, out[h, i, 2:])
-    return out
 
 
-@kernel
+@kernel_lean
 def _count_guess(a, angle, p, k, prepared):
     """Motor position for an axis angle, worm gear left out; NaN where the actuator cannot reach it."""
     travel = (angle - k[K.angle_at_zero_rad + a] - p[P.axis_1_zero_rad + a]) * k[K.sign + a]
@@ -222,7 +235,7 @@ def _count_guess(a, angle, p, k, prepared):
     return travel / (1.0 + p[P.axis_1_gain + a]) * k[K.counts_per_unit + a]
 
 
-@kernel
+@kernel_lean
 def _worm(p, k, a, angle):
     """How far a worm gear has to turn its axis for the axis to be at an angle.
 
@@ -237,9 +250,37 @@ def _worm(p, k, a, angle):
     return worm
 
 
-@kernel
-def command_one(p, k, prepared, m, out, state, wanted):
-    """Axis angles, then counts, that make the mirror send the row's source to its target; returns 0 if done."""
+@kernel_lean
+def _swept(m, centre, wanted, c0, c1, c2):
+    """How the normal that a row wants changes when the mirror's centre moves a little."""
+    d0 = d1 = d2 = 0.0
+    for end in range(2):
+        at, is_point = (M.source_enu, M.source_is_point) if end == 0 else (M.target_enu, M.target_is_point)
+        if m[is_point] == 0.0:
+            continue
+        x, y, z = m[at] - centre[0], m[at + 1] - centre[1], m[at + 2] - centre[2]
+        inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+        x, y, z = x * inverse, y * inverse, z * inverse
+        along = x * c0 + y * c1 + z * c2
+        # before it is scaled, the bisector is twice the cosine of half the angle long
+        half = x * wanted[0] + y * wanted[1] + z * wanted[2]
+        by = inverse / (2.0 * half) if half > 0.05 else 0.0
+        d0, d1, d2 = d0 - by * (c0 - along * x), d1 - by * (c1 - along * y), d2 - by * (c2 - along * z)
+    along = d0 * wanted[0] + d1 * wanted[1] + d2 * wanted[2]
+    return d0 - along * wanted[0], d1 - along * wanted[1], d2 - along * wanted[2]
+
+
+@kernel_lean
+def command_one(p, k, prepared, m, near, out, state, wanted):
+    """Counts that make the mirror send the row's source to its target; returns 0 if done.
+
+    ``near`` holds axis angles not far from the wanted ones, NaN if unknown, and those that were found afterwards.
+    """
+    # beyond the zenith there is another way to the same normal: no guess may lead there
+    if abs(near[1]) < _STEEP:
+        status = _command_from(near[0], near[1], p, k, prepared, m, near, out, state, wanted)
+        if abs(near[1]) < _STEEP:
+            return status
     for i in range(3):
         state[3 + i] = prepared[PIVOT + i]
     bisector(m, state[3:], wanted)
@@ -247,8 +288,14 @@ def command_one(p, k, prepared, m, out, state, wanted):
     x = prepared[0] * wanted[0] + prepared[3] * wanted[1] + prepared[6] * wanted[2]
     y = prepared[1] * wanted[0] + prepared[4] * wanted[1] + prepared[7] * wanted[2]
     z = prepared[2] * wanted[0] + prepared[5] * wanted[1] + prepared[8] * wanted[2]
-    azimuth = math.atan2(x, y)
-    elevation = math.atan2(z, math.hypot(x, y))
+    azimuth, elevation = math.atan2(x, y), math.atan2(z, math.hypot(x, y))
+    return _command_from(azimuth, elevation, p, k, prepared, m, near, out, state, wanted)
+
+
+@kernel_lean
+def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, wanted):
+    """Newton's method from axis angles; those that it ends with go to ``found``, NaN if it does not."""
+    found[0] = found[1] = np.nan
     done = False
     for _ in range(30):
         sa, ca = math.sin(azimuth), math.cos(azimuth)
@@ -269,6 +316,16 @@ def command_one(p, k, prepared, m, out, state, wanted):
         r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
         a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
         b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
+        # the centre goes with it, and with the centre the normal that is wanted
+        c0, c1, c2 = state[3] - prepared[PIVOT], state[4] - prepared[PIVOT + 1], state[5] - prepared[PIVOT + 2]
+        d0, d1, d2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
+        a0, a1, a2 = a0 - d0, a1 - d1, a2 - d2
+        x, y = sa * p[P.axis_offset_m], ca * p[P.axis_offset_m]
+        c0 -= prepared[0] * x + prepared[1] * y
+        c1 -= prepared[3] * x + prepared[4] * y
+        c2 -= prepared[6] * x + prepared[7] * y
+        d0, d1, d2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
+        b0, b1, b2 = b0 - d0, b1 - d1, b2 - d2
         aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
         ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
         determinant = aa * bb - ab * ab
@@ -278,6 +335,9 @@ def command_one(p, k, prepared, m, out, state, wanted):
         elevation += (aa * be - ab * ae) / determinant
     if not done:
         return 1
+    if abs(azimuth) > math.pi:  # where a guess was a turn away
+        azimuth -= 2.0 * math.pi * math.floor(azimuth / (2.0 * math.pi) + 0.5)
+    found[0], found[1] = azimuth, elevation
     # an azimuth axis may have to be taken a whole turn further to lie within its counts
     for a in range(2):
         angle = azimuth if a == 0 else elevation
@@ -297,20 +357,25 @@ def command_one(p, k, prepared, m, out, state, wanted):
     return 0
 
 
-@kernel_parallel
 def command_batch(p, k, row):
     """Counts (heliostat, posture, 2) for rows of source and target, and a status: 0 done, 1 no solution, 2 limits."""
-    n = row.shape[1]
-    out = np.full((len(p), n, 2), np.nan)
-    status = np.empty((len(p), n), np.int8)
-    for h in prange(len(p)):
+    out = np.full((len(p), row.shape[1], 2), np.nan)
+    status = np.empty((len(p), row.shape[1]), np.int8)
+    _command_rows(len(p), p, k, row, out, status)
+    return out, status
+
+
+@kernel_rows
+def _command_rows(begin, end, p, k, row, out, status):
+    for h in range(begin, end):
         prepared = np.empty(N_PREPARED)
         state = np.empty(6)
         wanted = np.empty(3)
+        near = np.empty(2)
         prepare(p[h], k[h], prepared)
-        for i in range(n):
-            status[h, i] = command_one(p[h], k[h], prepared, row[h, i], out[h, i], state, wanted)
-    return out, status
+        for i in range(row.shape[1]):
+            near[:] = np.nan
+            status[h, i] = command_one(p[h], k[h], prepared, row[h, i], near, out[h, i], state, wanted)
 
 
 @kernel
@@ -451,17 +516,25 @@ def _fit_one(
     return -max_iteration, noise
 
 
-@kernel_parallel
 def fit_batch(start, k, count, row, use, free, scale, low, high, mean, weight, huber, sigma_known, max_iteration):
     """Fit many heliostats; returns parameters, iterations and noise in units of the stated sigma."""
     p = start.copy()
     iterations = np.empty(len(p), np.int64)
     noise = np.empty(len(p))
-    for h in prange(len(p)):
-        done, sigma = _fit_one(
+    _fit_rows(
+        len(p), p, k, count, row, use, free, scale, low, high, mean, weight, huber, sigma_known, max_iteration,
+        iterations, noise,
+    )  # fmt: skip
+    return p, iterations, noise
+
+
+@kernel_rows
+def _fit_rows(
+    begin, end, p, k, count, row, use, free, scale, low, high, mean, weight, huber, sigma_known, max_iteration,
+    iterations, noise,
+):  # fmt: skip
+    for h in range(begin, end):
+        iterations[h], noise[h] = _fit_one(
             p[h], k[h], count[h], row[h], use[h], free, scale, low[h], high[h], mean[h], weight,
             huber, sigma_known, max_iteration,
         )  # fmt: skip
-        iterations[h] = done
-        noise[h] = sigma
-    return p, iterations, noise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -124,11 +125,9 @@ def _efficiency(
     Mean square of the loss's slope over the squared mean of its curvature, in two dimensions: expected for Gaussian
     noise where sigma is known or assumed, else of the residuals themselves, freed of what the parameters took up.
     """
-    from scipy.special import erfc
-
     cut = settings.huber
     tail = float(np.exp(-0.5 * cut**2))
-    linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0
+    linear = 0.5 * cut * np.sqrt(0.5 * np.pi) * math.erfc(cut / np.sqrt(2.0)) if np.isfinite(cut) else 0.0
     expected = np.full(len(norm), (1.0 - tail) / (1.0 - tail + linear) ** 2)
     if settings.sigma_known:
         return expected

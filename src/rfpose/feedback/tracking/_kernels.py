@@ -17,7 +17,7 @@ from rfpose.checks import FloatArray
 from rfpose.feedback._kernels import N_PREPARED, N_ROW, axis_angle, bisector, command_one, posture, prepare, stand
 from rfpose.feedback.columns import K, M, P
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers, law_step, stepper_step
-from rfpose.jit import kernel
+from rfpose.jit import kernel, kernel_lean
 
 NO_FEEDBACK, RADIO, ENCODER, SUN_SENSOR = 0, 1, 2, 3
 
@@ -28,7 +28,9 @@ GO, FOLLOW, TRACK = 0, 1, 2
 MOTOR, AXIS, COMMAND, NEXT, SLIP, MOVED, INNOVATION, SHIFT, RAMP = 0, 2, 4, 6, 8, 10, 12, 14, 17
 GOAL, LEARNED, SILENT, STARTED, UNREACHABLE, CLOUDED, FRESH = 20, 22, 23, 24, 25, 26, 27
 SWING, RATE, SINCE = 28, 32, 34
-N_STATE = 35
+# axis angles by the model: expected for the next sun, of the last one, and what the shift turned them by
+EXPECTED, AIMED, TURNED = 35, 37, 39
+N_STATE = 41
 
 # a measurement on its way: what became of it, the error to steer by, the innovation to learn from
 N_RING, N_ENTRY = 16, 6
@@ -275,6 +277,8 @@ class Workspace(NamedTuple):
     receiver: FloatArray
     aside: FloatArray
     work: FloatArray
+    jacobian: FloatArray
+    gain: FloatArray
 
 
 @kernel
@@ -283,11 +287,18 @@ def _workspace():
     return Workspace(
         np.empty(len(P)), np.empty(N_PREPARED), np.empty(N_PREPARED), np.empty(6), np.empty(6), np.empty(6),
         np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty(2), np.empty(N_ROW),
-        np.empty(N_ROW), np.empty(N_ROW), np.empty(6),
+        np.empty(N_ROW), np.empty(N_ROW), np.empty(6), np.empty((2, len(P))), np.empty((len(P), 2)),
     )  # fmt: skip
 
 
-@kernel
+@kernel_lean
+def _copy(values, out):
+    """Fill an array with as many values as it has room for; a slice that is set makes a copy in between."""
+    for i in range(len(out)):
+        out[i] = values[i]
+
+
+@kernel_lean
 def _caught(error, table, per_rad):
     """What of its light a mirror with this error of its normal brings into the aperture."""
     place = error * per_rad
@@ -297,7 +308,7 @@ def _caught(error, table, per_rad):
     return table[i] + (place - i) * (table[i + 1] - table[i])
 
 
-@kernel
+@kernel_lean
 def _carried(heard, angle, loop, out):
     """Turn a direction about the celestial pole by an angle, as the sky turns."""
     s, c = math.sin(angle), math.cos(angle)
@@ -308,7 +319,7 @@ def _carried(heard, angle, loop, out):
     out[2] = c * heard[2] + s * heard[0] * loop.pole_n + along * loop.pole_u
 
 
-@kernel
+@kernel_lean
 def _flatten(n, v):
     """Take from a vector what lies along a normal."""
     along = n[0] * v[0] + n[1] * v[1] + n[2] * v[2]
@@ -316,7 +327,7 @@ def _flatten(n, v):
         v[i] -= along * n[i]
 
 
-@kernel
+@kernel_lean
 def _off(row, posture, wanted):
     """Angle between a normal and the one that the row wants from this mirror centre."""
     bisector(row, posture[3:], wanted)
@@ -326,7 +337,7 @@ def _off(row, posture, wanted):
     return math.sqrt(total)
 
 
-@kernel
+@kernel_lean
 def _across(n, e, out):
     """Write what of ``e`` lies along the mirror's right and up, for a normal ``n``; return cos of the elevation."""
     h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
@@ -335,7 +346,7 @@ def _across(n, e, out):
     return max(h, _NEAR_ZENITH)
 
 
-@kernel
+@kernel_lean
 def _along(n, right, up, out):
     """Write the vector with these parts along the mirror's right and up."""
     h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
@@ -344,18 +355,15 @@ def _along(n, right, up, out):
     out[2] = h * up
 
 
-@kernel
-def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, state):
+@kernel_lean
+def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, state, room):
     """One step of the rolling fit (Kalman): innovation of right and up, averaged, into parameters and covariance."""
     nf = len(free)
-    jacobian = np.empty((2, nf))
-    base = np.empty(2)
-    moved = np.empty(2)
-    n = np.empty(3)
-    d = np.empty(3)
+    jacobian, gain = room.jacobian, room.gain
+    n, d, moved = room.hoped, room.error, room.counts
     prepare(p, k, prepared)
     stand(count[0], count[1], p, k, prepared, 1.0, state)
-    n[:] = state[:3]
+    _copy(state, n)
     for f in range(nf):
         step = 1e-2 * scale[f]
         kept = p[free[f]]
@@ -369,7 +377,6 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
         jacobian[0, f] = moved[0] / step
         jacobian[1, f] = moved[1] / step
         cov[f, f] += walk[f]
-    gain = np.empty((nf, 2))
     for f in range(nf):
         for a in range(2):
             total = 0.0
@@ -385,10 +392,10 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
     s11 += variance
     determinant = s00 * s11 - s01 * s01
     if determinant > 0.0:
-        base[0] = (s11 * innovation[0] - s01 * innovation[1]) / determinant
-        base[1] = (s00 * innovation[1] - s01 * innovation[0]) / determinant
+        right = (s11 * innovation[0] - s01 * innovation[1]) / determinant
+        up = (s00 * innovation[1] - s01 * innovation[0]) / determinant
         for f in range(nf):
-            p[free[f]] += gain[f, 0] * base[0] + gain[f, 1] * base[1]
+            p[free[f]] += gain[f, 0] * right + gain[f, 1] * up
         for f in range(nf):
             w0 = (s11 * gain[f, 0] - s01 * gain[f, 1]) / determinant
             w1 = (s00 * gain[f, 1] - s01 * gain[f, 0]) / determinant
@@ -399,8 +406,8 @@ def _learn(p, k, count, free, scale, variance, innovation, cov, walk, prepared, 
     prepare(p, k, prepared)
 
 
-@kernel
-def _command(p, k, prepared, row, is_dish, sun, out, work, wanted):
+@kernel_lean
+def _command(p, k, prepared, row, is_dish, sun, near, out, work, wanted):
     """Counts that send this sun to the row's target, or a dish to the sun; True where the mirror can reach them."""
     for i in range(3):
         row[M.source_enu + i] = sun[i]
@@ -408,10 +415,10 @@ def _command(p, k, prepared, row, is_dish, sun, out, work, wanted):
             row[M.target_enu + i] = sun[i]
     out[0] = np.nan
     out[1] = np.nan
-    return command_one(p, k, prepared, row, out, work, wanted) == 0
+    return command_one(p, k, prepared, row, near, out, work, wanted) == 0
 
 
-@kernel
+@kernel_lean
 def _nearest_turn(near, k, counts):
     """Take axis 1 the whole turns on that bring it nearest to where it is, if its limits allow."""
     turn = 2.0 * math.pi * k[K.counts_per_unit]
@@ -420,16 +427,15 @@ def _nearest_turn(near, k, counts):
         counts[0] = moved
 
 
-@kernel
-def _shifted(p, k, prepared, shift, counts, guess, row, work, wanted):
-    """Move counts so that the model's normal is turned by a small vector; True where the mirror can reach that."""
-    stand(counts[0], counts[1], p, k, prepared, 0.0, guess)
+@kernel_lean
+def _shifted(p, k, prepared, shift, counts, near, row, work, wanted):
+    """Counts that turn the model's normal ``wanted`` by a small vector; True where the mirror can reach that."""
     for i in range(3):
-        row[M.source_enu + i] = row[M.target_enu + i] = guess[i] + shift[i]
-    return command_one(p, k, prepared, row, counts, work, wanted) == 0
+        row[M.source_enu + i] = row[M.target_enu + i] = wanted[i] + shift[i]
+    return command_one(p, k, prepared, row, near, counts, work, wanted) == 0
 
 
-@kernel
+@kernel_lean
 def _swing(loop, noise, rate_right, rate_up, state):
     """Let the structure swing through a step after its motors took on new speeds [rad a servo step]."""
     for a in range(2):
@@ -444,7 +450,7 @@ def _swing(loop, noise, rate_right, rate_up, state):
         state[RATE + a] = rate
 
 
-@kernel
+@kernel_lean
 def _bend(n, right, up):
     """Turn a normal by small angles."""
     h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
@@ -457,7 +463,7 @@ def _bend(n, right, up):
         n[i] *= inverse
 
 
-@kernel
+@kernel_lean
 def _track(h, first, end, tasks, stretch, room):
     """One mirror through steps ``first`` to before ``end`` of a stretch."""
     loop, law, drive_1, drive_2, table = stretch.steering
@@ -484,19 +490,21 @@ def _track(h, first, end, tasks, stretch, room):
     trace = stretch.courses.trace[max(stretch.courses.stored[h], 0)]
     step0 = stretch.step0
     p, prepared, known, guess, true, still = room[:6]
-    wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = room[6:]
+    wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = room[6:17]
     is_dish = target[3] > 0.5
-    p[:] = built
+    _copy(built, p)
     row[:] = 0.0
-    row[M.target_enu : M.target_enu + 3] = tasks.aim[h]
+    _copy(tasks.aim[h], row[M.target_enu : M.target_enu + 3])
     row[M.target_is_point] = 0.0 if is_dish else 1.0
     row[M.sigma_rad] = 1.0
-    receiver[:] = row
-    receiver[M.target_enu : M.target_enu + 3] = target[:3]
+    _copy(row, receiver)
+    _copy(target, receiver[M.target_enu : M.target_enu + 3])
     aside[:] = 0.0
     aside[M.sigma_rad] = 1.0  # a row whose light comes from and goes to one direction
     plate_up, plate_right = p[P.receiver_plane_up_rad], p[P.receiver_plane_right_rad]
     prepare(model, k, known)
+    near, aimed, turned_by = state[EXPECTED:AIMED], state[AIMED:TURNED], state[TURNED:N_STATE]
+    shift = state[SHIFT:RAMP]
     stood_1 = stood_2 = np.nan
     axis_1 = axis_2 = 0.0
     turned = True
@@ -522,21 +530,29 @@ def _track(h, first, end, tasks, stretch, room):
             ahead = loop.interval - g % loop.interval
             word = min(g // loop.control - (step0 + first) // loop.control, len(age) - 1)
             if fresh or (renew and s == first):
-                seen[:] = sun[s]
+                _copy(sun[s], seen)
                 if math.isfinite(age[word]):
                     _carried(heard[word], loop.turn * (age[word] + s - first), loop, seen)
-                reached = _command(model, k, known, row, is_dish, seen, counts, work, wanted)
+                near[:] = np.nan
+                aimed[:] = np.nan
+                reached = _command(model, k, known, row, is_dish, seen, near, counts, work, wanted)
                 if reached:
                     _nearest_turn(state[NEXT] if fresh else state[MOTOR], k, counts)
                     state[NEXT], state[NEXT + 1] = counts[0], counts[1]
             state[COMMAND], state[COMMAND + 1] = state[NEXT], state[NEXT + 1]
-            seen[:] = sun[s + ahead]
+            _copy(sun[s + ahead], seen)
             if math.isfinite(age[word]):
                 _carried(heard[word], loop.turn * (age[word] + s - first + ahead), loop, seen)
-            reached = _command(model, k, known, row, is_dish, seen, counts, work, wanted) and reached
-            shift = state[SHIFT : SHIFT + 3]
+            reached = _command(model, k, known, row, is_dish, seen, near, counts, work, wanted) and reached
+            for a in range(2):
+                across[a] = near[a] + turned_by[a]
+                # one interval on, the sun will have gone on
+                before, aimed[a] = aimed[a], near[a]
+                near[a] += near[a] - before if math.isfinite(before) else 0.0
             if reached and (shift[0] != 0.0 or shift[1] != 0.0 or shift[2] != 0.0):
-                reached = _shifted(model, k, known, shift, counts, guess, aside, work, wanted)
+                reached = _shifted(model, k, known, shift, counts, across, aside, work, wanted)
+                for a in range(2):
+                    turned_by[a] = across[a] - aimed[a] if reached else 0.0
             # from where the motor is: near the zenith commands swing faster than it can follow
             _nearest_turn(state[COMMAND] if fresh else state[MOTOR], k, counts)
             if reached:
@@ -608,7 +624,7 @@ def _track(h, first, end, tasks, stretch, room):
                     state[SHIFT + i] -= guess[i]
                 _learn(
                     model, k, state[MOTOR : MOTOR + 2], free, scale, own / m + loop.wind_variance, across, cov, walk,
-                    known, guess,
+                    known, guess, room,
                 )  # fmt: skip
                 # what the model has learned comes off the shift, so that the mirror does not jump
                 stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
@@ -645,7 +661,7 @@ def _track(h, first, end, tasks, stretch, room):
         if turned:  # in most seconds no motor takes a step
             posture(axis_1, axis_2, p, prepared, 0.0, still)
             turned = False
-        true[:] = still
+        _copy(still, true)
         push = mean_speed * mean_speed + 2.0 * mean_speed * gust[s]
         right, up = bend[0] * push, bend[1] * push
         if loop.swings:

@@ -35,12 +35,15 @@ Progress = Callable[[int, int], None]
 
 _DRAWS = 2000
 """Random places tried for a tower before another attempt begins."""
+_FIRST_DRAWS = 50
 _ATTEMPTS = 20
 """Attempts to place all towers before the constraints count as impossible."""
 _WORST_POWER = 12.0
 _BAND = 0.02
 """Width of the ranks that stand for a percentile while searching, so that it has a slope."""
 FEASIBLE = 1e-6
+_UNUSED = np.empty((0, 0, 3, 3))
+"""Slopes of planes where no plane is laid through receivers."""
 _FEW_POINTS = 5000
 """Field points below which a search keeps to one core."""
 
@@ -120,8 +123,17 @@ class TowerProblem:
     def margins(self, x: FloatArray) -> FloatArray:
         return self._margins(x)[0]
 
-    def margin_slopes(self, x: FloatArray) -> FloatArray:
-        return self._margins(x)[1]
+    def margins_once(self) -> tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]:
+        """Return margins and slopes as two functions, which work both out once where they are asked in turn."""
+        seen, known = np.empty(0), (np.empty(0), np.empty(0))
+
+        def at(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            nonlocal seen, known
+            if not np.array_equal(x, seen):
+                seen, known = x.copy(), self._margins(x)
+            return known
+
+        return lambda x: at(x)[0].copy(), lambda x: at(x)[1].copy()
 
     def _margins(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what must not be negative (constraint,), scaled, and its slope (constraint, variable)."""
@@ -178,7 +190,7 @@ def _rows(
     slope = np.zeros((n, len(transmitter), 3))
     _kernels.objective_rows(
         n, CRITERIA[criterion], kernel_field(transmitter, field), np.full(len(transmitter), sigma_m**-2.0),
-        plane_slope(field.receiver_mirror_m), value, slope,
+        plane_slope(field.receiver_mirror_m) if criterion == "independent" else _UNUSED, value, slope,
     )  # fmt: skip
     return value, slope
 
@@ -358,10 +370,14 @@ def draw_places(problem: TowerProblem, n_new: int, rng: np.random.Generator) -> 
             which = rng.choice(len(boxes), size=_DRAWS, p=area / area.sum())
             ground = rng.uniform(boxes[which, 0], boxes[which, 1])
             place = np.column_stack([ground, rng.uniform(*rules.height_m, size=_DRAWS)])
-            free = np.flatnonzero(problem.is_free(place, np.vstack([problem.existing, placed])[:, :2]))
-            if not free.size:
+            others = np.vstack([problem.existing, placed])[:, :2]
+            few, rest = place[:_FIRST_DRAWS], place[_FIRST_DRAWS:]  # mostly one of a few will do
+            free = few[problem.is_free(few, others)]
+            if not len(free):
+                free = rest[problem.is_free(rest, others)]
+            if not len(free):
                 break
-            placed = np.vstack([placed, place[free[0]]])
+            placed = np.vstack([placed, free[0]])
         if len(placed) == n_new:
             return placed
         most = max(most, len(placed))
@@ -383,7 +399,8 @@ def _search(problem: TowerProblem, start: FloatArray) -> FloatArray | None:
     """SLSQP from one start; None where it ends outside the constraints."""
     n = len(start)
     low, high = (h / problem.scale for h in problem.constraints.height_m)
-    constraint: dict[str, Any] = {"type": "ineq", "fun": problem.margins, "jac": problem.margin_slopes}
+    margins, slopes = problem.margins_once()
+    constraint: dict[str, Any] = {"type": "ineq", "fun": margins, "jac": slopes}
     from scipy.optimize import minimize
 
     result = minimize(  # type: ignore[call-overload]
