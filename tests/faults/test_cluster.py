@@ -174,6 +174,25 @@ def test_tasks_that_kill_their_workers_are_given_up(cluster: distributed.LocalCl
         list(team.map(lambda _shared, _item: os._exit(1), [0], 0))
 
 
+def test_a_full_disk_of_a_worker_harms_nothing(
+    recording: Path, alone: bytes, cluster: distributed.LocalCluster, tmp_path: Path
+) -> None:
+    """What workers find is written where the job was started."""
+
+    def let_files_grow_to(limit: int) -> None:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+
+    with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+        client.run(let_files_grow_to, 0)
+        try:
+            _done(Engine(scheduler=cluster.scheduler_address), lambda: process(recording, tmp_path / "r.h5"))
+        finally:
+            client.run(let_files_grow_to, -1)
+    assert (tmp_path / "r.h5").read_bytes() == alone
+
+
 def test_what_tasks_raise_reaches_the_caller(cluster: distributed.LocalCluster) -> None:
     for by in (Engine(), Engine(scheduler=cluster.scheduler_address)):
         with by.used(), team_of() as team, pytest.raises(ZeroDivisionError):
