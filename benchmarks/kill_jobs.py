@@ -39,7 +39,7 @@ import rfpose.pipeline.simulate
 import rfpose.pipeline.track as tracking
 from rfpose.pipeline.formats.checkpoint import Checkpoint
 
-_fork = multiprocessing.get_context("fork")
+fork = multiprocessing.get_context("fork")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,12 +66,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+")
     asked = parser.parse_args()
-    # what is kept of unfinished work is kept often, so that kills meet it
-    measure.JOURNAL_SAMPLES = 100_000
-    tracking.Checkpoint = functools.partial(_often, Checkpoint)  # type: ignore[misc]
+    often_kept()
     rng, wrong = random.Random(asked.seed), False
     with tempfile.TemporaryDirectory() as name:
-        for title, jobs in _jobs(Path(name)).items():
+        for title, jobs in jobs_in(Path(name)).items():
             if asked.only is None or title in asked.only:
                 for i, job in enumerate(jobs):
                     kills = asked.kills * (i + 1) // len(jobs) - asked.kills * i // len(jobs)
@@ -79,11 +77,18 @@ def main() -> None:
     sys.exit(wrong)
 
 
+def often_kept() -> None:
+    """Let jobs that are forked from here keep unfinished work often, so that kills meet it."""
+    measure.JOURNAL_SAMPLES = 100_000
+    tracking.Checkpoint = functools.partial(_often, Checkpoint)  # type: ignore[misc]
+
+
 def _often(kind: Callable[..., Checkpoint], *arguments: object, **settings: object) -> Checkpoint:
     return kind(*arguments, **settings | {"interval_s": 0.0})
 
 
-def _jobs(folder: Path) -> dict[str, list[Job]]:
+def jobs_in(folder: Path) -> dict[str, list[Job]]:
+    """Return jobs by command; what they read is made in a folder."""
     site, toml = rf.load_scenario(rf.shipped_scenario("table2_100m.toml")), str(folder / "site.toml")
     changes = {"frame_count": 40, "frame_interval_s": 0.1, "sun_azimuth_deg": 170.0}
     site = site.changed(heliostat=site.heliostat[:1], radio={"frame_samples": 20_000}, simulation=changes)
@@ -92,7 +97,7 @@ def _jobs(folder: Path) -> dict[str, list[Job]]:
     (folder / "day.toml").write_text(day.changed(tracking=hours).to_toml())
     recording = str(folder / "rec.h5")
     # by a process of its own: what has started threads cannot be forked
-    _begin(Job(words=("simulate", toml), output=recording)).join()
+    begin(Job(words=("simulate", toml), output=recording)).join()
     convert = ("convert", recording)
     return {
         "simulate": [Job(words=("simulate", toml, "--seed", "3"))],
@@ -109,13 +114,13 @@ def _jobs(folder: Path) -> dict[str, list[Job]]:
 def _kill_often(folder: Path, job: Job, kills: int, rng: random.Random) -> bool:
     folder.mkdir()
     os.chdir(folder)
-    _undisturbed(folder, job)  # compiles
-    known = _undisturbed(folder, job)
+    undisturbed(folder, job)  # compiles
+    known = undisturbed(folder, job)
     shown = " ".join(Path(word).name for word in (*job.words, "-o", job.output))
     print(f"{shown}: {known.lasts_s:.1f} s, and writes in the last {known.writes_s:.1f} s of them", flush=True)
     counts: collections.Counter[str] = collections.Counter()
     for k in range(kills):
-        process = _begin(job)
+        process = begin(job)
         if k % 2:
             while process.is_alive() and not _began_to_write(folder):
                 time.sleep(1e-3)
@@ -135,8 +140,9 @@ def _kill_often(folder: Path, job: Job, kills: int, rng: random.Random) -> bool:
     return any("WRONG" in outcome for outcome in counts)
 
 
-def _begin(job: Job) -> multiprocessing.process.BaseProcess:
-    process = _fork.Process(target=_run, args=((*job.words, "-o", job.output),))
+def begin(job: Job, *more: str) -> multiprocessing.process.BaseProcess:
+    """Start the command, with more options."""
+    process = fork.Process(target=_run, args=((*job.words, "-o", job.output, *more),))
     process.start()
     return process
 
@@ -153,8 +159,9 @@ def _began_to_write(folder: Path) -> bool:
     return any(not name.endswith(".lock") for name in os.listdir(folder))
 
 
-def _undisturbed(folder: Path, job: Job) -> Undisturbed:
-    began, process, writes = time.monotonic(), _begin(job), None
+def undisturbed(folder: Path, job: Job) -> Undisturbed:
+    """Run a job to its end in an empty folder, and empty that."""
+    began, process, writes = time.monotonic(), begin(job), None
     while process.is_alive():
         if writes is None and _began_to_write(folder):
             writes = time.monotonic()
@@ -162,12 +169,12 @@ def _undisturbed(folder: Path, job: Job) -> Undisturbed:
     ended = time.monotonic()
     if process.exitcode:
         raise SystemExit(f"rfpose {' '.join(job.words)} ends with {process.exitcode}")
-    left = _left(folder)
-    _clear(folder)
-    return Undisturbed(left=left, lasts_s=ended - began, writes_s=ended - (writes or ended))
+    found = left(folder)
+    clear(folder)
+    return Undisturbed(left=found, lasts_s=ended - began, writes_s=ended - (writes or ended))
 
 
-def _left(folder: Path) -> dict[str, str]:
+def left(folder: Path) -> dict[str, str]:
     """Return a digest of each file but locks; of Digital RF, in which times of writing stand, of the samples."""
     files = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
     found = {name: _digest(path.read_bytes()) for name, path in files.items() if not name.endswith(".lock")}
@@ -185,7 +192,8 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _clear(folder: Path) -> None:
+def clear(folder: Path) -> None:
+    """Remove what is in a folder."""
     for path in folder.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
@@ -197,24 +205,24 @@ def _judge(folder: Path, job: Job, known: Undisturbed, code: int | None) -> str:
     """Return what was left, and what the same command makes of that."""
     try:
         there = (folder / job.output).exists()
-        found = _left(folder)
+        found = left(folder)
         if there and any(found.get(name) != held for name, held in known.left.items()):
             return "WRONG: what has the name is not what the undisturbed job makes"
         if code == 0 and not there:
             return "WRONG: it ended well, and nothing has the name"
         beside = found.keys() - known.left.keys()
-        again = _begin(job)
+        again = begin(job)
         again.join()
         # what is whole is no more to be made, which the same command may say
         if again.exitcode not in ((0, 3) if there else (0,)):
             return f"WRONG: the same command ends with {again.exitcode}"
-        if _left(folder) != known.left:
-            return f"WRONG: the same command leaves something else: {sorted(_left(folder))[:9]}"
+        if left(folder) != known.left:
+            return f"WRONG: the same command leaves something else: {sorted(left(folder))[:9]}"
         state = "over before the kill" if code == 0 else "killed, whole" if there else "killed, nothing"
         kept = any(not name.split("/")[0].endswith(".part") for name in beside)
         return f"{state} under the name{', unfinished work beside it' if kept else ''}; again: the same"
     finally:
-        _clear(folder)
+        clear(folder)
 
 
 if __name__ == "__main__":

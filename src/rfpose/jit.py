@@ -233,6 +233,12 @@ def _cache_class() -> Any:
                     self.flush()  # type: ignore[no-untyped-call]
                     return None
 
+        def save_overload(self, sig: Any, data: Any) -> None:
+            try:
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            except OSError as error:  # a full disk; what was compiled serves this process
+                _teller.hear_unkept(error)
+
     return KernelCache
 
 
@@ -303,6 +309,12 @@ class _Teller:
                 "they cannot be kept, since neither the directory of rfpose nor that of the user can be written; set "
                 "NUMBA_CACHE_DIR to a directory that can"
             )
+
+    def hear_unkept(self, error: OSError) -> None:
+        """Take note that a compiled kernel could not be written."""
+        if self.can_keep:
+            _log.warning("compiled kernels cannot be kept: %s", error.strerror or error)
+        self.can_keep = False
 
 
 _teller = _Teller()

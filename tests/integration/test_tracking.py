@@ -1,5 +1,6 @@
 """A field tracked by all methods: what each reaches, what makes it worse, and that runs can be repeated."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -150,6 +151,36 @@ def test_a_restored_run_goes_on_as_if_nothing_had_happened(default_hour):
         mine, whole = second.state(), default_hour.state()
         for name in mine:
             np.testing.assert_array_equal(mine[name], whole[name], err_msg=f"{method.name} {name}")
+
+
+def test_days_and_methods_simulated_apart_are_those_of_one_run():
+    # hidden transmitters: their draws are radio's alone, and a portion without radio lacks them
+    site = scenario(days=2, last_hour=9.3, radio={"hidden_transmitters": 0.1})
+    methods = ("open-loop", "encoder", "radio-both")
+    whole = run(site, methods, count=2)
+    parts = TrackingSimulation(site, methods=methods, count=2, seed=1)
+    for _ in range(3):  # a day and half of the next, which begins again
+        parts.advance()
+    portions = parts.portions(4)
+    assert [(p.methods, p.first_day, p.end_day) for p in portions] == [
+        (("radio-both",), 0, 2), (("open-loop",), 1, 2), (("encoder",), 1, 2),
+    ]  # fmt: skip
+    found = {p: TrackingSimulation(site, methods=p.methods, count=2, seed=1).go_through(p) for p in portions[::-1]}
+    for portion in portions[1:]:
+        parts.take(portion, found[portion])
+    rest = TrackingSimulation(site, methods=methods, count=2, seed=1)
+    rest.restore({name: values.copy() for name, values in parts.state().items()})
+    parts.take(portions[0], found[portions[0]])
+    assert parts.portions(4) == []
+    while rest.done < rest.n_segment:
+        rest.advance()
+    for name in methods:
+        for results in (TrackingSimulation.sums, TrackingSimulation.curves):
+            for field in dataclasses.fields(results(whole, name)):
+                wanted = getattr(results(whole, name), field.name)
+                for other in (parts, rest):
+                    got = getattr(results(other, name), field.name)
+                    assert got.tobytes() == wanted.tobytes(), f"{name} {field.name}"
 
 
 def test_foundations_that_creep_need_new_models():

@@ -74,3 +74,17 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_changes(tmp_path):
         command = [sys.executable, "-c", CALL.format(kind=kind)]
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert done.stdout.strip() == wanted, done.stderr
+
+
+def test_a_full_disk_costs_what_would_be_kept_and_not_the_work(tmp_path):
+    (tmp_path / "inner_kernels.py").write_text(CALLED.format(kind="Shape", factor=2))
+    run = (
+        "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); from inner_kernels import doubled; "
+        "print(doubled(3.0))"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    done = subprocess.run([sys.executable, "-c", run], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "6.0\n"
+    assert "compiled kernels cannot be kept: File too large" in done.stderr
+    assert list(tmp_path.rglob("*.nb*")) == []
