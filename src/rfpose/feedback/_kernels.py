@@ -5,12 +5,16 @@ a row ``m``. `rfpose.feedback.columns` names their columns: P, K and M.
 """
 
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rfpose.feedback.columns import MEASUREMENT, K, M, P
 from rfpose.jit import kernel, kernel_lean, kernel_rows
 from rfpose.multilat.equations._kernels import factor, solve_factored
+
+Array = npt.NDArray[Any]
 
 N_ROW = sum(MEASUREMENT.values())
 # what is prepared of a mount: rotation by rows, pivot, opening angles at count zero, sine and cosine of the
@@ -165,7 +169,7 @@ def _residuals(p, k, count, row, use, out):
             out[i, j] = (state[j] - wanted[j]) / row[i, M.sigma_rad]
 
 
-def residuals_batch(p, k, count, row, use):
+def residuals_batch(p: Array, k: Array, count: Array, row: Array, use: Array) -> Array:
     """Residuals of many heliostats (heliostat, measurement, xyz), in sigma."""
     out = np.empty((len(p), row.shape[1], 3))
     _residuals_rows(len(p), p, k, count, row, use, out)
@@ -178,7 +182,7 @@ def _residuals_rows(begin, end, p, k, count, row, use, out):
         _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
 
 
-def jacobian_batch(p, k, count, row, use, free, scale):
+def jacobian_batch(p: Array, k: Array, count: Array, row: Array, use: Array, free: Array, scale: Array) -> Array:
     """Central differences of the residuals by free parameters, (heliostat, measurement, xyz, parameter)."""
     out = np.empty((len(p), row.shape[1], 3, len(free)))
     _jacobian_rows(len(p), p, k, count, row, use, free, scale, out)
@@ -203,7 +207,7 @@ def _jacobian_rows(begin, end, p, k, count, row, use, free, scale, out):
                     out[h, i, j, f] = (high[i, j] - low[i, j]) / (2.0 * step)
 
 
-def posture_batch(p, k, count, receiver):
+def posture_batch(p: Array, k: Array, count: Array, receiver: float) -> Array:
     """Axis angles, normal and centre (heliostat, posture, 8)."""
     out = np.empty((len(p), count.shape[1], 8))
     _posture_rows(len(p), p, k, count, receiver, out)
@@ -357,7 +361,7 @@ def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, want
     return 0
 
 
-def command_batch(p, k, row):
+def command_batch(p: Array, k: Array, row: Array) -> tuple[Array, Array]:
     """Counts (heliostat, posture, 2) for rows of source and target, and a status: 0 done, 1 no solution, 2 limits."""
     out = np.full((len(p), row.shape[1], 2), np.nan)
     status = np.empty((len(p), row.shape[1]), np.int8)
@@ -516,7 +520,22 @@ def _fit_one(
     return -max_iteration, noise
 
 
-def fit_batch(start, k, count, row, use, free, scale, low, high, mean, weight, huber, sigma_known, max_iteration):
+def fit_batch(
+    start: Array,
+    k: Array,
+    count: Array,
+    row: Array,
+    use: Array,
+    free: Array,
+    scale: Array,
+    low: Array,
+    high: Array,
+    mean: Array,
+    weight: Array,
+    huber: float,
+    sigma_known: bool,
+    max_iteration: int,
+) -> tuple[Array, Array, Array]:
     """Fit many heliostats; returns parameters, iterations and noise in units of the stated sigma."""
     p = start.copy()
     iterations = np.empty(len(p), np.int64)
