@@ -22,7 +22,7 @@ from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import KEYS, columns_of, open_result, result_of
 from rfpose.scenario import Scenario, parse_scenario
 
-__all__ = ["LiveResult", "ResultFollower", "is_live", "open_live", "partial_of", "probe_in"]
+__all__ = ["LiveResult", "ResultFollower", "is_live", "n_frame_in", "open_live", "partial_of", "probe_in"]
 
 _SCENARIO = "scenario"
 _PROBE = "first frame"
@@ -175,6 +175,15 @@ def open_live(directory: str | Path, first_frame: int = 0) -> Result:
         raise
     except _DAMAGES as error:
         raise RecordingError(f"{directory}: damaged ({error}); process the recording again") from error
+
+
+def n_frame_in(directory: str | Path) -> int:
+    """Count the frames so far of a result that is being made; none where there is no such directory."""
+    try:
+        found = entries_in(Path(directory))
+    except OSError:
+        return 0
+    return found[-1][1] if found else 0
 
 
 def _frames_from(directory: Path, first_frame: int, end_frame: int | None = None) -> Iterator[Entry]:
