@@ -95,6 +95,7 @@ def main() -> None:
     latency_s: list[float] = []
     memory: list[float] = []
     writing_s: list[float] = []
+    spent_s: list[float] = []
 
     def on_frame(_result: Result) -> None:
         seen = time.time()
@@ -102,6 +103,7 @@ def main() -> None:
         latency_s.append(seen - at)
         writing_s.append(took)
         memory.append(memory_mb())
+        spent_s.append(time.process_time())
         if len(latency_s) < asked.frames:
             here.send(None)
 
@@ -136,6 +138,7 @@ def main() -> None:
         f"latency after the first frame: median {1e3 * np.median(later):.0f} ms, "
         f"95 % {1e3 * np.quantile(later, 0.95):.0f} ms, worst {1e3 * later.max():.0f} ms"
     )
+    print(f"processor time a frame, both cores together: median {1e3 * np.median(np.diff(spent_s)):.0f} ms")
     for k, (times, sizes) in enumerate(zip(np.array_split(later, 10), np.array_split(memory[1:], 10), strict=True)):
         if asked.day:
             print(f"  tenth {k + 1:2d}: latency median {1e3 * np.median(times):5.1f} ms, memory {sizes[-1]:.0f} MB")
