@@ -25,6 +25,7 @@ from rfpose.cli._app import app
 from rfpose.errors import InvalidInputError, PublishError
 from rfpose.multilat import PoseStatus
 from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import columns_of, result_of
 from rfpose.pipeline.publish import SCHEMA, Broker, PlantServer, messages, send, serving
 
 BROKER = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
@@ -333,7 +334,14 @@ def test_a_client_reads_the_last_frame_with_status_and_time(result: Result) -> N
     url = f"opc.tcp://127.0.0.1:{_free_port()}"
 
     async def ask() -> dict[str, Any]:
-        async with serving(result, PlantServer(url=url, anonymous=True)):
+        columns = {
+            path: values[:1] if c.dims[0] == "frame" else values for path, (c, values) in columns_of(result).items()
+        }
+        first = result_of(result.scenario, result.settings, columns)
+        async with serving(first, PlantServer(url=url, anonymous=True)) as show:
+            before = await _read(asyncua.Client(url))
+            np.testing.assert_array_equal(before["H02", "Normal"].Value.Value, result.poses.normal_enu[0, 1])
+            await show(result)  # as a result that is followed goes on
             return await _read(asyncua.Client(url))
 
     read = asyncio.run(ask())

@@ -15,7 +15,9 @@ from PySide6.QtGui import QDropEvent, QMouseEvent
 from PySide6.QtWidgets import QApplication
 
 from rfpose.errors import RecordingError
+from rfpose.pipeline.follow import Follow
 from rfpose.pipeline.pictures.field_view import FieldPicture
+from rfpose.pipeline.process import process
 from rfpose.scenario import load_scenario
 from rfpose.viewer.preferences import Preferences
 from rfpose.viewer.state.document import Document
@@ -653,3 +655,25 @@ def test_tracking_run_is_played_and_scrubbed(
     qtbot.waitUntil(lambda: window.session.playback.frame == len(run.unix_s) - 1, timeout=10_000)
     assert not window.session.playback.playing
     assert view.play.text() == "Play"
+
+
+def test_a_result_that_is_made_is_followed_to_its_end(window, wait, files: dict[str, Path], tmp_path: Path) -> None:
+    output, frames = tmp_path / "live.h5", []
+
+    def stop_after_two(result) -> None:
+        frames.append(result)
+        if len(frames) == 2:
+            raise KeyboardInterrupt
+
+    window.follow_path(output)
+    assert "waiting for its first frame" in window.session.message.text
+    with pytest.raises(KeyboardInterrupt):
+        process(files["recording"], output, follow=Follow(on_frame=stop_after_two))
+    wait(window, lambda: window.session.document is not None)
+    assert (window.session.document.n_frame, window.session.selection.frame) == (2, 1)
+    window.session.select(heliostat=1)
+    process(files["recording"], output, follow=Follow())
+    wait(window, lambda: window.session.document.path == output)
+    assert (window.session.document.n_frame, window.session.selection.frame) == (3, 2)
+    assert window.session.selection.heliostat == 1
+    assert window.current() == "field"

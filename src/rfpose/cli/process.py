@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 import rfpose
 from rfpose.cli._engine import engine_options
@@ -30,6 +33,8 @@ from rfpose.cli._support import (
 )
 
 if TYPE_CHECKING:
+    from rfpose.pipeline.follow import Follow
+    from rfpose.pipeline.formats.result import Result
     from rfpose.recording.declared import Declared
 
 __all__ = ["ESTIMATOR_NAMES", "POSE_NAMES", "REFLECTION_NAMES", "command"]
@@ -53,6 +58,16 @@ class _How:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class _Following:
+    """Options of ``--follow``."""
+
+    follow: bool
+    idle_timeout_s: float
+    until: str | None
+    lateness_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Tables:
     """Tables to write besides the result."""
 
@@ -70,6 +85,7 @@ class _Tables:
         "rfpose process recording.h5 -o result.h5 --filter",
         "rfpose process night/*.h5 cal0/ mirror*.sigmf-meta -o result.h5",
         "rfpose process /data/night -o result.h5 --scheduler tcp://host:8786",
+        "rfpose process /data/night -o result.h5 --follow --idle-timeout 600",
     ),
 )
 @click.argument("recording", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -117,12 +133,24 @@ class _Tables:
 @click.option("--csv", type=click.Path(path_type=Path), help="Also write the poses as CSV.")
 @click.option("--parquet", type=click.Path(path_type=Path), help="Also write the poses as Parquet; needs pyarrow.")
 @click.option("--profile", is_flag=True, help="Also tell the seconds of each stage, and what takes longest.")
+@click.option(
+    "--follow",
+    is_flag=True,
+    help="RECORDING is being written: solve each frame when it is complete. Frames so far are in RESULT.partial.",
+)
+@click.option("--idle-timeout", "idle_timeout_s", type=click.FloatRange(min=0.0, min_open=True), default=60.0,
+              show_default=True, help="With --follow: it has ended when nothing came for so long [s].")  # fmt: skip
+@click.option("--until", metavar="TIME", help="With --follow: end with the first frame then or later, as "
+              "2026-09-21T14:00:00Z.")  # fmt: skip
+@click.option("--lateness", "lateness_s", type=click.FloatRange(min=0.0), default=1.0, show_default=True,
+              help="With --follow: wait so long for receivers that lag behind the others [s].")  # fmt: skip
 @declared_options
 @engine_options
 @follow_links_option
 @force_option
 @common_options
 @gathered("how", _How)
+@gathered("following", _Following)
 @gathered("tables", _Tables)
 @click.pass_obj
 def command(
@@ -131,6 +159,7 @@ def command(
     output: Path,
     scenario: Path | None,
     how: _How,
+    following: _Following,
     tables: _Tables,
     profile: bool,
     declared: Declared | None,
@@ -143,11 +172,13 @@ def command(
     scenario need --scenario. Several are one recording: receivers apart, one after the other, formats mixed; so are
     those in a directory, and those that a manifest names (recording.toml).
 
-    Interrupted or killed, the same command goes on where it stopped; the result is the same.
+    Interrupted or killed, the same command goes on where it stopped; the result is the same. With --follow the
+    recording may still be written, or begin later: Digital RF, or a directory of closed rfpose-iq files.
     """
     session.when_interrupted = "interrupted; the same command resumes where it stopped"
     claimed = outputs(output, tables.csv, tables.parquet, inputs=[*recording, scenario, how.survey], force=force)
-    with claimed, progress("Measuring") as on_progress, contextlib.ExitStack() as open_files:
+    with claimed, contextlib.ExitStack() as open_files:
+        on_progress = None if following.follow else open_files.enter_context(progress("Measuring"))
         check_table(tables.parquet, ".parquet")
         given: Any = recording
         if declared is not None:
@@ -159,6 +190,7 @@ def command(
             output,
             scenario=scenario,
             **asdict(how),
+            follow=_follow(following, output, session, is_declared=declared is not None),
             follow_links=follow_links,
             force=force,
             on_progress=on_progress,
@@ -190,6 +222,56 @@ def command(
         say(f"  {line}")
     if profile and result.profile is not None:
         _say_profile(result.profile)
+
+
+def _follow(following: _Following, output: Path, session: CommonOptions, *, is_declared: bool) -> Follow | None:
+    """Return how the recording is followed; None: it is complete."""
+    context = click.get_current_context()
+    if not following.follow:
+        for name in ("idle_timeout_s", "until", "lateness_s"):
+            if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+                raise click.UsageError("--idle-timeout, --until and --lateness go with --follow")
+        return None
+    if is_declared:
+        raise click.UsageError("--follow reads Digital RF and rfpose-iq; leave --format out")
+    session.when_interrupted = (
+        f"interrupted; frames so far are in {output}.partial, and the same command goes on where it stopped"
+    )
+    from rfpose.pipeline.follow import Follow
+    from rfpose.recording.declared import seconds_of
+
+    return Follow(
+        idle_timeout_s=following.idle_timeout_s,
+        until_s=None if following.until is None else seconds_of(following.until, "`until`"),
+        lateness_s=following.lateness_s,
+        on_frame=_Heard(),
+    )
+
+
+class _Heard:
+    """Says now and then how far a recording is followed."""
+
+    def __init__(self) -> None:
+        self._n_frame, self._said_at = 0, -math.inf
+
+    def __call__(self, result: Result) -> None:
+        self._n_frame += 1
+        if time.monotonic() - self._said_at < _SAID_EVERY_S:
+            return
+        self._said_at = time.monotonic()
+        solved, wanted = int((result.poses.status == 0).sum()), result.poses.status.size
+        at = _frame_text(result)
+        click.echo(f"rfpose: {self._n_frame} frames; that of {at}: {solved} of {wanted} poses solved", err=True)
+
+
+_SAID_EVERY_S = 10.0
+
+
+def _frame_text(result: Result) -> str:
+    """Return when the last frame of a result began."""
+    from rfpose.pipeline.formats.result import frame_time
+
+    return f"{frame_time(int(result.frame_start_index[-1]), result.sample_rate):%Y-%m-%dT%H:%M:%SZ}"
 
 
 def _say_profile(profile: Mapping[str, Any]) -> None:

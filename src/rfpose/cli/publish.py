@@ -23,6 +23,7 @@ from rfpose.cli._support import (
 from rfpose.errors import InvalidInputError, PublishError
 
 if TYPE_CHECKING:
+    from rfpose.pipeline.formats.live_result import ResultFollower
     from rfpose.pipeline.publish import PlantServer
 
 __all__ = ["PASSWORD_VARIABLE", "command"]
@@ -55,6 +56,7 @@ class _ToBroker:
         "rfpose publish result.h5 --mqtt mqtt://localhost --prefix plant/field",
         "rfpose publish result.h5 --opcua opc.tcp://0.0.0.0:4840 --certificate cert.pem --key key.pem --user scada",
         "rfpose publish result.h5 --opcua opc.tcp://127.0.0.1:4840 --anonymous",
+        "rfpose publish result.h5 --follow --mqtt mqtt://localhost",
     ),
 )
 @click.argument("result", type=click.Path(path_type=Path))
@@ -62,6 +64,8 @@ class _ToBroker:
     "--mqtt", metavar="URL", help="Send to this broker: mqtt://HOST[:PORT], or encrypted mqtts://HOST[:PORT]."
 )
 @click.option("--opcua", metavar="URL", help="Be an OPC UA server there until interrupted: opc.tcp://HOST:PORT.")
+@click.option("--follow", is_flag=True, help="RESULT is being made by `rfpose process --follow`: hand on each frame.")
+@click.option("--new", "only_new", is_flag=True, help="With --follow: leave out the frames that are there already.")
 @click.option("--prefix", default="rfpose", show_default=True, help="Of MQTT topics: PREFIX/pose/HELIOSTAT.")
 @click.option("--user", help="Who we are for the broker; whom the server lets in.")
 @click.option(
@@ -86,6 +90,8 @@ def command(
     result: Path,
     mqtt: str | None,
     opcua: str | None,
+    follow: bool,
+    only_new: bool,
     user: str | None,
     password_file: Path | None,
     anonymous: bool,
@@ -95,11 +101,14 @@ def command(
     """Hand the poses of RESULT to the plant.
 
     By MQTT every frame's poses, QoS 1, as JSON whose schema is in PREFIX/schema; the command ends when the broker has
-    all of them. By OPC UA the last frame's, until interrupted.
+    all of them. By OPC UA the last frame's, until interrupted. With --follow RESULT may still be made: frames are
+    handed on as they come, until it is complete.
     """
     if (mqtt is None) == (opcua is None):
         raise click.UsageError("give one of --mqtt and --opcua")
-    check_there(result, password_file, keys.ca, keys.certificate, keys.key)
+    if only_new and not follow:
+        raise click.UsageError("--new goes with --follow")
+    check_there(None if follow else result, password_file, keys.ca, keys.certificate, keys.key)
     password = _password(password_file) if user is not None else None
     if opcua is not None:
         session.when_interrupted = "interrupted; the server has ended"
@@ -115,18 +124,21 @@ def command(
             password=password,
             anonymous=anonymous,
         )
-        _serve(result, to)
+        _serve(result, to, follower=_follower(result, only_new=only_new) if follow else None)
         return
     if anonymous:
         raise click.UsageError("--anonymous goes with --opcua")
     session.when_interrupted = "interrupted; part of the messages may have been sent"
     from rfpose.pipeline.formats.result_file import open_result
-    from rfpose.pipeline.publish import Broker, messages, send
+    from rfpose.pipeline.publish import Broker, messages, messages_as_they_come, send
 
     broker = Broker(url=str(mqtt), user=user, password=password, **asdict(keys), **asdict(to_broker))
-    found = open_result(result)
-    with progress("Sending") as on_progress:
-        sent = send(messages(found), broker, on_progress=on_progress, n_message=found.poses.status.size)
+    if follow:
+        sent = send(messages_as_they_come(_follower(result, only_new=only_new)), broker)
+    else:
+        found = open_result(result)
+        with progress("Sending") as on_progress:
+            sent = send(messages(found), broker, on_progress=on_progress, n_message=found.poses.status.size)
     told = {
         "broker": mqtt,
         "acknowledged": sent.acknowledged,
@@ -145,9 +157,18 @@ def command(
     say(f"{mqtt}: {sent.acknowledged} messages arrived, the schema among them")
 
 
-def _serve(result: Path, to: PlantServer) -> None:
+def _follower(result: Path, *, only_new: bool) -> ResultFollower:
+    """Return who sees the frames of a result as they come."""
+    from rfpose.pipeline.formats.live_result import ResultFollower, is_live, partial_of
+
+    if not result.exists() and not is_live(partial_of(result)):
+        click.echo(f"rfpose: note: {result}: not begun yet; waiting for its first frame", err=True)
+    return ResultFollower(result, first_frame=None if only_new else 0)
+
+
+def _serve(result: Path, to: PlantServer, *, follower: ResultFollower | None) -> None:
     from rfpose.pipeline.formats.result_file import open_result
-    from rfpose.pipeline.publish import serve
+    from rfpose.pipeline.publish import serve, serve_as_they_come
 
     def on_ready(address: str) -> None:
         if wants_json():
@@ -155,7 +176,10 @@ def _serve(result: Path, to: PlantServer) -> None:
         else:
             say(f"{address}: serving the last frame of {result}; Ctrl-C ends it")
 
-    serve(open_result(result), to, on_ready=on_ready)
+    if follower is not None:
+        serve_as_they_come(follower, to, on_ready=on_ready)
+    else:
+        serve(open_result(result), to, on_ready=on_ready)
 
 
 def _password(file: Path | None) -> str:

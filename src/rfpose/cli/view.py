@@ -37,6 +37,7 @@ _WINDOW = (1280, 800)
         "rfpose view recording.h5",
         "rfpose view site.toml --save layout.png",
         "rfpose view result.h5 --view field --heliostat H05 --save field.pdf",
+        "rfpose view result.h5 --follow",
         "rfpose view result.h5 --save report.html",
         "rfpose view result.h5 --save report.html --frame 0 --frame 4 --heliostat H05 --heliostat H11",
     ),
@@ -54,6 +55,8 @@ _WINDOW = (1280, 800)
               help="Show this frame, from 0; repeated, a map for each in a report.")  # fmt: skip
 @click.option("--size", type=(click.IntRange(min=400), click.IntRange(min=300)), metavar="WIDTH HEIGHT",
               help="Of the window [pixel]; figures have the width of a page.")  # fmt: skip
+@click.option("--follow", is_flag=True, help="FILE is a result that `rfpose process --follow` makes: show frames as "
+              "they come.")  # fmt: skip
 @click.option("--theme", type=click.Choice(THEMES), help="Default: light for pictures, the last one for the window.")
 @follow_links_option
 @force_option
@@ -66,6 +69,7 @@ def command(
     heliostats: tuple[str, ...],
     frames: tuple[int, ...],
     size: tuple[int, int] | None,
+    follow: bool,
     theme: str | None,
     follow_links: bool,
     force: bool,
@@ -76,12 +80,18 @@ def command(
 
         if heliostats or frames or view:
             raise click.UsageError("--view, --heliostat and --frame go with --save; in the window they are clicked")
-        code = run(file, scenario_path=scenario, theme=theme, size=size or _WINDOW, follow_links=follow_links)
+        if follow and (file is None or scenario is not None):
+            raise click.UsageError("--follow needs the FILE of a result, which brings its scenario")
+        code = run(
+            file, scenario_path=scenario, theme=theme, size=size or _WINDOW, follow_links=follow_links, follow=follow
+        )
         if wants_json():
             emit_json({"file": file, "saved": None, "view": None})
         if code:
             click.get_current_context().exit(code)
         return
+    if follow:
+        raise click.UsageError("--follow is of the window; a figure is drawn once")
     if file is None:
         raise click.UsageError("--save needs a FILE to draw")
     if size is not None:

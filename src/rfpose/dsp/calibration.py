@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CalibrationStatus",
+    "CalibrationWindow",
     "PhaseAverage",
     "PhaseCalibration",
     "average_phases",
@@ -417,3 +419,39 @@ def calibrate(tones: TonePhases, scenario: Scenario) -> PhaseCalibration:
     average = phase_average(tones.phase_rad, tones.sigma_rad, scenario)
     phase, sigma, drift, status = interpolate_phase(average.phase_rad, average.sigma_rad, frame_times(tones, scenario))
     return PhaseCalibration(phase_rad=phase, sigma_rad=sigma, drift_rad_per_sqrt_s=drift, status=status)
+
+
+class CalibrationWindow:
+    """Electronic phases frame by frame, of a recording whose later frames are not there yet.
+
+    Where all transmitters are measured in every frame they are those of `calibrate`. A transmitter that is missing is
+    held from the last of so many frames, where `calibrate` would interpolate; how much it drifts is read off these.
+
+    Parameters
+    ----------
+    scenario
+        Places of the calibration receivers and transmitters; at least one calibration receiver.
+    n_frame
+        Frames that are remembered.
+    """
+
+    def __init__(self, scenario: Scenario, n_frame: int = 32) -> None:
+        self._scenario = scenario
+        self._kept: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=n_frame)
+
+    def add(self, tones: TonePhases) -> PhaseCalibration:
+        """Return the electronic phases of one more frame.
+
+        Parameters
+        ----------
+        tones
+            Of this frame alone, along the scenario's receiver axis.
+        """
+        average = phase_average(tones.phase_rad, tones.sigma_rad, self._scenario)
+        self._kept.append((int(tones.frame_start_index[0]), average.phase_rad, average.sigma_rad))
+        starts, phases, sigmas = zip(*self._kept, strict=True)
+        time_s = np.array([start - starts[0] for start in starts]) / self._scenario.radio.sample_rate_hz
+        phase, sigma, drift, status = interpolate_phase(np.concatenate(phases), np.concatenate(sigmas), time_s)
+        return PhaseCalibration(
+            phase_rad=phase[-1:], sigma_rad=sigma[-1:], drift_rad_per_sqrt_s=drift, status=status[-1:]
+        )

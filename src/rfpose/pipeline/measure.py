@@ -7,9 +7,9 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import GapError, Recording, open_recording
 from rfpose.scenario import Scenario
 
-__all__ = ["JOURNAL_SAMPLES", "OtherProcesses", "extractors", "journal_key", "measure_tones"]
+__all__ = ["JOURNAL_SAMPLES", "FrameByFrame", "OtherProcesses", "extractors", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
 """Samples measured here between two entries of the journal, and by each thread elsewhere: about a second's work."""
@@ -184,6 +184,61 @@ def extractors(recording: Recording, scenario: Scenario, estimator: str = "hilbe
         return as_told if tuned is None else others.get(tuned, as_told)
 
     return of
+
+
+class FrameByFrame:
+    """Measures frames as they come, each as `measure_tones` would among all; a context manager.
+
+    Parameters
+    ----------
+    recording, scenario, estimator
+        As for `measure_tones`.
+    before
+        Phases of the frames before, of which the last says where the receivers' clocks were; None: there are none.
+    """
+
+    def __init__(
+        self, recording: Recording, scenario: Scenario, *, estimator: str, before: TonePhases | None = None
+    ) -> None:
+        self._recipe = _Recipe(scenario=scenario, frame_start_index=np.empty(0, np.int64), estimator=estimator)
+        self._bench = _Bench(recording, self._recipe)
+        self._clock_ppm = np.full(len(scenario.receiver_ids), np.nan)
+        if before is not None and len(before.frame_start_index):
+            seen = np.any(before.status[-1] == LineStatus.OK, axis=1)
+            self._clock_ppm = np.where(seen, before.clock_ppm[-1], np.nan)
+        self._open = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        self._team = self._open.enter_context(team_here())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def measure(self, start_index: int) -> TonePhases:
+        """Return the phases of the frame that begins with a sample.
+
+        Raises
+        ------
+        RecordingError
+            The recording is damaged.
+        """
+        scenario, n_receiver = self._recipe.scenario, self._bench.n_receiver
+        starts = np.array([start_index], np.int64)
+        self._bench.recipe = replace(self._recipe, frame_start_index=starts)
+        tones = TonePhases.empty(
+            receiver_ids=scenario.receiver_ids,
+            transmitter_ids=scenario.transmitter_ids,
+            tone_hz=scenario.tone_hz,
+            frame_start_index=starts,
+        )
+        rows = [np.array([i]) for i in range(n_receiver)]
+        wanted = [_Wanted(0, n_receiver, row, self._clock_ppm[row]) for row in rows]
+        for i, measured in self._team.map(_measure_here, wanted, self._bench):
+            self._clock_ppm[rows[i]] = measured.clock_ppm
+            for row, found in measured.rows:
+                tones.put(*divmod(row, n_receiver), found)
+        return tones
 
 
 def _rows(tones: TonePhases) -> Entry:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,10 +33,12 @@ from rfpose.scenario import Scenario, scenario_of
 
 if TYPE_CHECKING:
     from rfpose.pipeline.choice import PoseChoice
+    from rfpose.pipeline.follow import Follow
     from rfpose.pipeline.formats.result import Result
+    from rfpose.pipeline.formats.survey_file import SurveyFile
     from rfpose.pipeline.measure import OtherProcesses
 
-__all__ = ["process"]
+__all__ = ["Asked", "note_differing_receivers", "process"]
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +54,7 @@ def process(
     integrity: bool | None = None,
     filtered: bool | None = None,
     survey: str | Path | None = None,
+    follow: Follow | None = None,
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
@@ -81,6 +84,9 @@ def process(
         Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
     survey
         File of `rfpose survey`: where receivers, pivots and transmitters are.
+    follow
+        The recording is being written: solve each frame when it is complete, until nothing comes any more. Frames so
+        far are in ``OUTPUT.partial``, which `open_result` reads meanwhile; needs ``output`` and one path.
     follow_links
         As for `rfpose.recording.open_recording`.
     force
@@ -114,22 +120,27 @@ def process(
     >>> result.poses.normal_enu.shape
     (2, 2, 3)
     """
+    asked = Asked(
+        scenario=scenario,
+        estimator=estimator,
+        pose=pose,
+        reflection=reflection,
+        integrity=integrity,
+        filtered=filtered,
+        survey=survey,
+    )
+    if follow is not None:
+        from rfpose.pipeline.follow import follow_recording
+
+        return follow_recording(recording, output, asked, follow, follow_links=follow_links, force=force)
     stages = Stopwatch()
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else files_of(recording)
-    scenario_file = None if isinstance(scenario, Scenario) else scenario
-    with claim(output, inputs=[*read, scenario_file, survey, kept], force=force) as job:
+    with claim(output, inputs=[*read, *asked.files, kept], force=force) as job:
         with contextlib.ExitStack() as open_files:
             with stages.during("open"):
                 opened = open_files.enter_context(_opened(recording, follow_links=follow_links))
-                site = _choose_scenario(opened, None if scenario is None else scenario_of(scenario))
-                surveyed = None
-                if survey is not None:
-                    from rfpose.pipeline.formats.survey_file import read_survey
-
-                    surveyed = read_survey(survey)
-                    site = surveyed.applied(site)
-                check_against(opened, site)
+                site, surveyed = asked.site_of(opened)
                 if isinstance(opened, PartsRecording):
                     from rfpose.pipeline.clocks import settle_clocks
 
@@ -140,19 +151,14 @@ def process(
                     open_files.callback(opened.close)
                 starts = _frames(opened, site)
                 # compiled code, which none of the refusals above should wait for
-                from rfpose.dsp import ESTIMATORS
-                from rfpose.pipeline.choice import choose
                 from rfpose.pipeline.formats.result_file import write_result
                 from rfpose.pipeline.formats.truth_rows import align_truth
                 from rfpose.pipeline.measure import journal_key, measure_tones
-                from rfpose.pipeline.solve import check_solvable, solve
+                from rfpose.pipeline.solve import solve
 
                 elsewhere = _elsewhere(recording, follow_links=follow_links)
-                if estimator not in ESTIMATORS:
-                    raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {estimator!r}")
-                choice = choose(site, pose=pose, reflection=reflection, integrity=integrity, filtered=filtered)
-                check_solvable(site, pose=pose, choice=choice)
-                _note_differing_receivers(opened, site)
+                choice = asked.choice_for(site)
+                note_differing_receivers(opened, site)
                 note_doubts(opened)
                 journal = None
                 if kept is not None:
@@ -167,8 +173,7 @@ def process(
                 stages=stages,
                 elsewhere=elsewhere,
             )
-            asked = {"reflection": reflection, "integrity": integrity, "filter": filtered, "survey": survey}
-            settings = _settings(opened, site, choice, estimator=estimator, asked=asked, given=scenario)
+            settings = asked.settings(opened, site, choice)
             truth = None if opened.truth is None else align_truth(opened.truth, site)
         with stages.during("poses"):
             if surveyed is not None:
@@ -184,6 +189,87 @@ def process(
         if journal is not None:
             job.afterwards(journal.remove)
         return replace(result, profile=stages.summary())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What is to be made of a recording: the arguments of `process` that say how."""
+
+    scenario: Scenario | str | Path | None
+    estimator: str
+    pose: str
+    reflection: str | None
+    integrity: bool | None
+    filtered: bool | None
+    survey: str | Path | None
+
+    @property
+    def files(self) -> list[str | Path | None]:
+        """What is read besides the recording."""
+        return [None if isinstance(self.scenario, Scenario) else self.scenario, self.survey]
+
+    def site_of(self, recording: Recording) -> tuple[Scenario, SurveyFile | None]:
+        """Return the site, as far as a survey knows it better, and the survey.
+
+        Raises
+        ------
+        RecordingError, ScenarioError
+            There is none, or it does not fit the recording.
+        """
+        site = _choose_scenario(recording, None if self.scenario is None else scenario_of(self.scenario))
+        surveyed = None
+        if self.survey is not None:
+            from rfpose.pipeline.formats.survey_file import read_survey
+
+            surveyed = read_survey(self.survey)
+            site = surveyed.applied(site)
+        check_against(recording, site)
+        return site, surveyed
+
+    def choice_for(self, site: Scenario) -> PoseChoice:
+        """Return the estimator of poses.
+
+        Raises
+        ------
+        InvalidInputError, ScenarioError, GeometryError
+            There is none of this name, or it cannot solve the site.
+        """
+        from rfpose.dsp import ESTIMATORS
+        from rfpose.pipeline.choice import choose
+        from rfpose.pipeline.solve import check_solvable
+
+        if self.estimator not in ESTIMATORS:
+            raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")
+        choice = choose(
+            site, pose=self.pose, reflection=self.reflection, integrity=self.integrity, filtered=self.filtered
+        )
+        check_solvable(site, pose=self.pose, choice=choice)
+        return choice
+
+    def settings(self, recording: Recording, site: Scenario, choice: PoseChoice) -> dict[str, str]:
+        """Return what the result depends on, without places and times: equal work gives equal bytes."""
+        command = f"rfpose process {shlex.join(recording.names)} --estimator {self.estimator} --pose {choice.pose}"
+        if isinstance(self.scenario, str | Path):
+            command += f" --scenario {Path(self.scenario).name}"
+        if self.survey is not None:
+            command += f" --survey {Path(self.survey).name}"
+        if self.reflection is not None:
+            command += f" --reflection {self.reflection}"
+        if self.integrity is not None:
+            command += " --integrity" if self.integrity else " --no-integrity"
+        if self.filtered is not None:
+            command += " --filter" if self.filtered else " --no-filter"
+        learns = choice.pose == "rigid" and site.learns_delays
+        given = self.scenario
+        return {
+            "version": __version__,
+            "command": command,
+            "recording": recording.path.name,
+            "recording_format": recording.format,
+            "scenario_from": "recording" if given is None else "caller" if isinstance(given, Scenario) else "file",
+            "estimator": self.estimator,
+            "delays": "learned" if learns else "as the scenario says",
+        }
 
 
 def _opened(
@@ -231,7 +317,8 @@ def _choose_scenario(recording: Recording, given: Scenario | None) -> Scenario:
     return given
 
 
-def _note_differing_receivers(recording: Recording, scenario: Scenario) -> None:
+def note_differing_receivers(recording: Recording, scenario: Scenario) -> None:
+    """Tell of receivers that only the recording, or only the scenario has."""
     missing = [name for name in scenario.receiver_ids if name not in recording.receiver_ids]
     if missing:
         _log.warning("%s: lacks %s of the scenario; marked as not recorded", recording.path, _listed(missing))
@@ -253,36 +340,3 @@ def _frames(recording: Recording, scenario: Scenario) -> npt.NDArray[np.int64]:
             f"{recording.path}: no stretch as long as a frame of {n_sample} samples; shorten radio.frame_samples"
         )
     return starts
-
-
-def _settings(
-    recording: Recording,
-    scenario: Scenario,
-    choice: PoseChoice,
-    *,
-    estimator: str,
-    asked: Mapping[str, object],
-    given: Scenario | str | Path | None,
-) -> dict[str, str]:
-    """Return what the result depends on, without places and times: equal work gives equal bytes."""
-    command = f"rfpose process {shlex.join(recording.names)} --estimator {estimator} --pose {choice.pose}"
-    if isinstance(given, str | Path):
-        command += f" --scenario {Path(given).name}"
-    if asked["survey"] is not None:
-        command += f" --survey {Path(str(asked['survey'])).name}"
-    if asked["reflection"] is not None:
-        command += f" --reflection {asked['reflection']}"
-    if asked["integrity"] is not None:
-        command += " --integrity" if asked["integrity"] else " --no-integrity"
-    if asked["filter"] is not None:
-        command += " --filter" if asked["filter"] else " --no-filter"
-    learns = choice.pose == "rigid" and scenario.learns_delays
-    return {
-        "version": __version__,
-        "command": command,
-        "recording": recording.path.name,
-        "recording_format": recording.format,
-        "scenario_from": "recording" if given is None else "caller" if isinstance(given, Scenario) else "file",
-        "estimator": estimator,
-        "delays": "learned" if learns else "as the scenario says",
-    }

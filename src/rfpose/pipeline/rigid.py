@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
 
@@ -16,9 +16,10 @@ from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix
 from rfpose.measurement import reflectors_of
 from rfpose.multilat import FilterSettings, FilterStatus, PoseStatus, RangeDifferences, filter_poses
 from rfpose.multilat.estimation import PoseEstimates, ReflectionModel, protected, solve_direct, solve_two_ray
+from rfpose.multilat.filtering import FilterState
 from rfpose.multilat.integrity import Alarms
 from rfpose.multilat.rigid import MirrorProblem, full_covariance
-from rfpose.multilat.rigid.delays import learn_delays
+from rfpose.multilat.rigid.delays import DelayState, learn_delays
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import (
@@ -32,10 +33,27 @@ from rfpose.pipeline.formats.result import (
 from rfpose.pipeline.mirrors import MirrorGroup, RigidInputs, calibration_sight, mirror_problems
 from rfpose.scenario import Scenario
 
-__all__ = ["RigidOutcome", "solve_rigid_poses"]
+__all__ = ["RigidMemory", "RigidOutcome", "solve_rigid_poses"]
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class RigidMemory:
+    """What poses rest on besides their own frame, from call to call: with it, frames can come a few at a time.
+
+    Attributes
+    ----------
+    origin_index
+        First sample of the first frame, from which times count; None: before that.
+    delays, filters
+        By the number of the mirrors' group.
+    """
+
+    origin_index: int | None = None
+    delays: dict[int, DelayState] = field(default_factory=dict)
+    filters: dict[int, FilterState] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +77,7 @@ def solve_rigid_poses(
     choice: PoseChoice,
     *,
     sample_rate: Fraction,
+    memory: RigidMemory | None = None,
 ) -> RigidOutcome:
     """Solve every mirror of every frame as a rigid body.
 
@@ -77,20 +96,32 @@ def solve_rigid_poses(
         The estimator; its ``pose`` is ``rigid``.
     sample_rate
         Of the recording, for the time between frames [1/s].
+    memory
+        Of the frames before these; it takes these in.
     """
     inputs = RigidInputs(
         tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice
     )
     tables = _Tables(inputs, independent)
     start = tones.frame_start_index
-    time_s = np.array([float((int(s) - int(start[0])) / sample_rate) for s in start])
-    for group, problem, again in mirror_problems(inputs):
+    memory = RigidMemory() if memory is None else memory
+    if memory.origin_index is None and len(start):
+        memory.origin_index = int(start[0])
+    time_s = np.array([float((int(s) - (memory.origin_index or 0)) / sample_rate) for s in start])
+    for i_group, (group, problem, again) in enumerate(mirror_problems(inputs)):
         found = _solved(inputs, group, problem, again)
         if group.estimator.delay_drift_m_per_sqrt_s is not None:
-            found = protected(tables.put_delays(group, found, time_s), scenario.integrity.missed_detection)
+            found, memory.delays[i_group] = tables.put_delays(group, found, time_s, state=memory.delays.get(i_group))
+            found = protected(found, scenario.integrity.missed_detection)
         tables.put(group, found)
         if choice.filtered:
-            tables.put_filtered(group, found, time_s, exposure_s=float(scenario.radio.frame_samples / sample_rate))
+            memory.filters[i_group] = tables.put_filtered(
+                group,
+                found,
+                time_s,
+                exposure_s=float(scenario.radio.frame_samples / sample_rate),
+                state=memory.filters.get(i_group),
+            )
     return tables.outcome()
 
 
@@ -232,8 +263,16 @@ class _Tables:
         out[:, : found.method.shape[1]] = np.where(np.isfinite(found.poses.tilt_sigma_rad)[:, None], found.method, 0)
         return out
 
-    def put_filtered(self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray, *, exposure_s: float) -> None:
-        """Filter a group's poses over frames and write them; poses that are doubted are left out."""
+    def put_filtered(
+        self,
+        group: MirrorGroup,
+        found: PoseEstimates,
+        time_s: FloatArray,
+        *,
+        exposure_s: float,
+        state: FilterState | None,
+    ) -> FilterState:
+        """Filter a group's poses over frames, write them and return the state; poses that are doubted are left out."""
 
         def by_frame(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
             return array.reshape(self._n_frame, len(group.column), *array.shape[1:])
@@ -253,6 +292,7 @@ class _Tables:
                 restart_after=table.restart_after,
                 max_coast_s=np.inf if table.max_coast_s is None else table.max_coast_s,
             ),
+            state=state,
         )
         cross = cross_matrix(tracked.normal_enu)
         values = {
@@ -265,13 +305,16 @@ class _Tables:
         }
         for name, array in values.items():
             self._filtered[name][:, group.column] = array
+        return tracked.state
 
     def _put(self, table: dict[str, npt.NDArray[Any]], group: MirrorGroup, values: dict[str, Any]) -> None:
         for name, array in values.items():
             table[name][:, group.column] = array.reshape(self._n_frame, len(group.column), *array.shape[1:])
 
-    def put_delays(self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray) -> PoseEstimates:
-        """Learn the delays of a group over frames, write them, and return its poses refined by them."""
+    def put_delays(
+        self, group: MirrorGroup, found: PoseEstimates, time_s: FloatArray, *, state: DelayState | None
+    ) -> tuple[PoseEstimates, DelayState]:
+        """Learn the delays of a group over frames, write them, and return its poses refined by them, and the state."""
         scenario = self._scenario
         speed = scenario.radio.propagation_speed_mps
         n_frame, n_helio = self._n_frame, len(group.column)
@@ -294,6 +337,7 @@ class _Tables:
             time_s=time_s,
             drift_m_per_sqrt_s=group.estimator.delay_drift_m_per_sqrt_s or 0.0,
             observed=by_frame(observed),
+            state=state,
         )
         n_receiver = group.rows.shape[1]
         shape = (n_frame, n_helio, n_class, n_receiver - 1)
@@ -314,7 +358,7 @@ class _Tables:
         for name, array in values.items():
             flat = array.reshape(n_frame * n_helio, *array.shape[2:])
             arrays[name] = np.where(refined.reshape(-1, *[1] * (flat.ndim - 1)), flat, getattr(poses, name))
-        return replace(found, poses=replace(poses, **arrays))
+        return replace(found, poses=replace(poses, **arrays)), learned.state
 
     def outcome(self) -> RigidOutcome:
         """Return the tables, those that were asked for."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose import __version__
-from rfpose.files import claim
+from rfpose.errors import InvalidInputError
+from rfpose.files import claim, make_directory
 from rfpose.recording import Recording, RecordingWriter
 from rfpose.recording.base import IqArray
 from rfpose.scenario import Scenario, scenario_of
+from rfpose.truth import Truth
 
 if TYPE_CHECKING:
     from rfpose.simulator import Simulator
@@ -130,6 +134,65 @@ class SimulatedRecording(Recording):
                         on_progress(done, self._simulator.total_samples)
                 writer.write_truth(self._simulator.truth)
 
+    def record(
+        self,
+        directory: str | Path,
+        *,
+        pace: float | None = 1.0,
+        force: bool = False,
+        on_progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Write the recording as a recorder would: one closed file a frame, when the frame is over.
+
+        Parameters
+        ----------
+        directory
+            Made if absent.
+        pace
+            Seconds of the recording in a second; None: as fast as frames come.
+        force
+            Overwrite files of the same names.
+        on_progress
+            Called with (frames done, frames).
+
+        Raises
+        ------
+        InvalidInputError
+            A pace that is not greater than zero.
+        RecordingError
+            A file exists, or cannot be written.
+        """
+        if pace is not None and not pace > 0.0:
+            raise InvalidInputError(f"`pace` must be greater than zero, got {pace}")
+        directory = make_directory(Path(directory))
+        starts = self._simulator.frame_start_index
+        n_sample = self._site.radio.frame_samples
+        began = time.monotonic()
+        for k, start in enumerate(starts.tolist()):
+            due_s = 0.0 if pace is None else float((start + n_sample - int(starts[0])) / self.sample_rate) / pace
+            if k == 0 and pace is not None:
+                began -= due_s  # the first frame has just been recorded
+            time.sleep(max(0.0, began + due_s - time.monotonic()))
+            with RecordingWriter(
+                directory / f"frame-{k:06d}.h5",
+                scenario=self._site,
+                receiver_ids=self.receiver_ids,
+                sample_rate=self.sample_rate,
+                centre_frequency_hz=self.centre_frequency_hz,
+                sample_format=self.sample_format,
+                full_scale=self.full_scale,
+                provenance=self.provenance,
+                overwrite=force,
+            ) as writer:
+                for name in self.receiver_ids:
+                    for first, count in self._segments_of(name).tolist():
+                        at, end = max(first, start), min(first + count, start + n_sample)
+                        if at < end:
+                            writer.write(name, at, self.read(name, at, end - at))
+                writer.write_truth(_truth_of_frame(self._simulator.truth, k))
+            if on_progress is not None:
+                on_progress(k + 1, len(starts))
+
     def as_dict(self) -> dict[str, Any]:
         """Return what was simulated, with stable keys."""
         return {
@@ -149,3 +212,10 @@ class SimulatedRecording(Recording):
         with ThreadPoolExecutor(thread_name_prefix="rfpose-simulate") as pool:
             for at, samples in pool.map(lambda piece: piece(), self._simulator.pieces(receiver_id, start, len(out))):
                 out[at : at + len(samples)] = samples
+
+
+def _truth_of_frame(truth: Truth, k: int) -> Truth:
+    """Return the truth of one frame."""
+    always = {"heliostat_ids", "receiver_ids", "transmitter_ids", "clock_ppm"}
+    values = {field.name: getattr(truth, field.name) for field in dataclasses.fields(truth)}
+    return Truth(**{name: v if v is None or name in always else v[k : k + 1] for name, v in values.items()})

@@ -28,7 +28,7 @@ from rfpose.multilat import (
 from rfpose.multilat.fix import Side, check_transmitters
 from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result
-from rfpose.pipeline.rigid import RigidOutcome, solve_rigid_poses
+from rfpose.pipeline.rigid import RigidMemory, RigidOutcome, solve_rigid_poses
 from rfpose.pipeline.stages import Stopwatch
 from rfpose.scenario import Scenario
 from rfpose.truth import Truth
@@ -36,7 +36,7 @@ from rfpose.truth import Truth
 if TYPE_CHECKING:
     from rfpose.pipeline.site import SiteOutcome
 
-__all__ = ["POSES", "check_solvable", "solve"]
+__all__ = ["POSES", "check_solvable", "no_calibration", "solve", "solve_calibrated"]
 
 _UNSURVEYED_M = 3.0
 """How far a pivot may be from where the scenario has it, if it is not surveyed."""
@@ -152,7 +152,34 @@ def solve(
     """
     check_solvable(scenario, pose=choice.pose, choice=choice)
     with contextlib.nullcontext() if stages is None else stages.during("calibration"):
-        calibration = calibrate(tones, scenario) if scenario.is_calibrated else _no_calibration(tones)
+        calibration = calibrate(tones, scenario) if scenario.is_calibrated else no_calibration(tones)
+    return solve_calibrated(
+        tones, calibration, scenario, choice, sample_rate=sample_rate, settings=settings, truth=truth
+    )
+
+
+def solve_calibrated(
+    tones: TonePhases,
+    calibration: PhaseCalibration,
+    scenario: Scenario,
+    choice: PoseChoice,
+    *,
+    sample_rate: Fraction,
+    settings: Mapping[str, str],
+    truth: Truth | None = None,
+    memory: RigidMemory | None = None,
+) -> Result:
+    """Find receiver positions and mirror normals where the transmitters' phases are known already; see `solve`.
+
+    Parameters
+    ----------
+    tones, scenario, choice, sample_rate, settings, truth
+        As for `solve`.
+    calibration
+        Of the same frames.
+    memory
+        Of the frames before these, of pose ``rigid``; it takes these in.
+    """
     ranges = _ranges(tones, calibration, scenario) if scenario.is_calibrated else _no_ranges(tones)
     poses = solve_poses(
         scenario.transmitter_enu_m,
@@ -183,6 +210,7 @@ def solve(
             scenario,
             choice,
             sample_rate=sample_rate,
+            memory=memory,
         )
     result = Result(
         scenario=scenario,
@@ -229,7 +257,8 @@ def _received(tones: TonePhases) -> npt.NDArray[np.bool_]:
     return np.asarray(np.isfinite(tones.phase_rad).any(axis=3))
 
 
-def _no_calibration(tones: TonePhases) -> PhaseCalibration:
+def no_calibration(tones: TonePhases) -> PhaseCalibration:
+    """Return that nothing is known of the transmitters' phases."""
     n_frame, _, n_transmitter, n_tone = tones.phase_rad.shape
     unknown = read_only(np.full((n_frame, n_transmitter, n_tone), np.nan))
     return PhaseCalibration(

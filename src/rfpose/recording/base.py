@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -131,6 +131,9 @@ class Recording(ABC):
         Whether indices count from the Unix epoch; else the file has no time, and they count from its start.
     """
 
+    grows: ClassVar[bool] = False
+    """Whether `refresh` may find more than there was when it was opened."""
+
     def __init__(
         self,
         path: Path,
@@ -175,6 +178,12 @@ class Recording(ABC):
 
     def close(self) -> None:  # noqa: B027  (a format that holds nothing open has nothing to do)
         """Release the files. The recording cannot be read afterwards."""
+
+    def refresh(self) -> None:  # noqa: B027  (most do not grow)
+        """Look for what was recorded since it was opened; only some formats can be read while they grow."""
+
+    def forget(self, before_index: int) -> None:  # noqa: B027
+        """Let go of what ends before a sample and will not be read any more, so that what grows stays small here."""
 
     # -- what callers use --------------------------------------------------------------------------------
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -36,6 +38,8 @@ _PROPERTIES: Final = "drf_properties.h5"
 _CACHE_BYTES = 2**28
 """Over all channels. A compressed file is inflated chunk by chunk, and a chunk may hold many frames."""
 _MOST_SUBCHANNELS = 1024
+_REMEMBERED_FILES: Final = 8
+"""Of a channel that grows: files of one time, which are listed again with new ones."""
 # H5Tget_class, bytes a component
 _SAMPLE_FORMATS: dict[tuple[int, int], SampleFormat] = {(0, 2): "int16", (1, 4): "complex64"}
 _HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError)
@@ -84,6 +88,8 @@ class DigitalRfRecording(Recording):
     A channel of several subchannels gives one receiver a subchannel: ``CHANNEL_r0``, ``CHANNEL_r1`` and so on.
     """
 
+    grows = True
+
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         library = import_digital_rf()
         if not follow_links:
@@ -127,6 +133,58 @@ class DigitalRfRecording(Recording):
         for _, file, _ in self._opened.values():
             file.close()
         self._opened.clear()
+
+    # -- growing -----------------------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Take in files that were completed since; one that cannot be read, or goes back in time, is left out."""
+        library = import_digital_rf()
+        for name, channel in self._channels.items():
+            known = set(channel.files[-_REMEMBERED_FILES:])
+            since = _time_of(channel.files[-1]) if channel.files else None
+            new = [path for path in _files(library, channel.directory, since) if path not in known]
+            if not new:
+                continue
+            channel.files.extend(new)
+            for receiver_id, (own, _) in self._place.items():
+                if own == name:
+                    self._segments.pop(receiver_id, None)
+                    self._blocks.pop(receiver_id, None)
+            for path in new if name in self._pieces else ():
+                self._take_in(name, path)
+
+    def _take_in(self, channel: str, path: Path) -> None:
+        pieces = self._pieces[channel]
+        try:
+            found = self._pieces_in(channel, path)
+            if found and pieces and found[0].start < pieces[-1].start + pieces[-1].length:
+                raise RecordingError(f"{path}: goes back in time: starts before `{pieces[-1].file.name}` ends")
+        except RecordingError as error:
+            _log.warning("%s; it is left out", error)
+            self._tell(channel, f"its file `{path.name}` is left out: {error}")
+        else:
+            pieces += found
+
+    def forget(self, before_index: int) -> None:
+        """Let go of files that end before a sample; a channel's last one is kept, by which new ones are known."""
+        for name, channel in self._channels.items():
+            if name in self._pieces:
+                pieces = self._pieces[name]
+                n_old = sum(piece.start + piece.length <= before_index for piece in pieces[:-1])
+                del pieces[:n_old]
+                first = pieces[0].file if pieces else None
+                n_old = channel.files.index(first) if first in channel.files else 0
+            else:
+                begins = [
+                    int(_time_of(path) / timedelta(milliseconds=1)) * channel.rate / 1000 for path in channel.files
+                ]
+                n_old = max(0, sum(begin <= before_index for begin in begins) - 1)
+            del channel.files[:n_old]
+            if n_old:
+                for receiver_id, (own, _) in self._place.items():
+                    if own == name:
+                        self._segments.pop(receiver_id, None)
+                        self._blocks.pop(receiver_id, None)
 
     # -- samples -----------------------------------------------------------------------------------------
 
@@ -278,17 +336,33 @@ def _channel(library: Any, properties: Path, *, follow_links: bool) -> _Channel:
             f"{8 * size} bits ({ {0: 'integer', 1: 'float'}.get(kind, 'other') }); rfpose reads complex int16 "
             "and complex float32: record or convert it to one of them"
         )
-    files = library.ilsdrf(
-        str(directory), recursive=False, include_drf=True, include_dmd=False, include_drf_properties=False
-    )
     return _Channel(
         directory=directory,
         rate=rate,
         sample_format=sample_format,
         n_subchannel=n_subchannel,
-        files=[Path(name) for name in files],
+        files=_files(library, directory),
         version=printable(str(found.get("digital_rf_version", ""))),
     )
+
+
+def _files(library: Any, directory: Path, since: timedelta | None = None) -> list[Path]:
+    """List a channel's files in order of time, those that begin at a time (since the epoch) or after it."""
+    found = library.ilsdrf(
+        str(directory),
+        recursive=False,
+        include_drf=True,
+        include_dmd=False,
+        include_drf_properties=False,
+        starttime=None if since is None else datetime(1970, 1, 1, tzinfo=UTC) + since,
+    )
+    return [Path(name) for name in found]
+
+
+def _time_of(path: Path) -> timedelta:
+    """Return the time since the epoch that a file is named by."""
+    found = re.search(r"@(\d+)\.(\d{3})\.h5$", path.name)
+    return timedelta() if found is None else timedelta(seconds=int(found[1]), milliseconds=int(found[2]))
 
 
 def _scalar(value: Any) -> Any:

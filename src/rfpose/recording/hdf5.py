@@ -7,7 +7,7 @@ import importlib
 import math
 import os
 from collections import deque
-from typing import Final
+from typing import Any, Final
 
 import h5py
 
@@ -36,14 +36,22 @@ def printable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-def find_item(file: h5py.File, place: str, *, follow_links: bool) -> h5py.Group | h5py.Dataset | None:
+def find_item(
+    file: h5py.File, place: str, *, follow_links: bool, within: h5py.Group | None = None
+) -> h5py.Group | h5py.Dataset | None:
     """Return what stands at an absolute place of a file, or None.
+
+    ``within``, the group that holds it, spares the way there.
 
     Raises
     ------
     RecordingError
         The way there leads into another file and ``follow_links`` is not set, or in a circle.
     """
+    with contextlib.suppress(_NotPlainError):
+        if within is not None:
+            return _plain_item(within.id, [place.rpartition("/")[2]])
+        return _plain_item(h5py.h5g.open(file.id, b"/"), [part for part in place.split("/") if part])
     group, parts, n_soft = file["/"], deque(part for part in place.split("/") if part), 0
     while parts:
         name = parts.popleft()
@@ -67,7 +75,32 @@ def find_item(file: h5py.File, place: str, *, follow_links: bool) -> h5py.Group 
     return group
 
 
-def find_dataset(file: h5py.File, place: str, *, follow_links: bool, per_stored: int) -> h5py.Dataset | None:
+class _NotPlainError(Exception):
+    """A link on the way is not there, or none of the hard ones that files are made with."""
+
+
+def _plain_item(group: h5py.h5g.GroupID, parts: list[str]) -> h5py.Group | h5py.Dataset | None:
+    """Return what `find_item` does where all links are hard: many times as fast, for files of many receivers."""
+    found: Any = group
+    for name in parts:
+        if not isinstance(found, h5py.h5g.GroupID):
+            return None
+        encoded = name.encode()
+        try:
+            link = found.links.get_info(encoded).type
+        except (KeyError, RuntimeError) as error:  # there is none, or it cannot be read
+            raise _NotPlainError from error
+        if link != h5py.h5l.TYPE_HARD:
+            raise _NotPlainError
+        found = h5py.h5o.open(found, encoded)
+    if isinstance(found, h5py.h5d.DatasetID):
+        return h5py.Dataset(found)
+    return h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else None
+
+
+def find_dataset(
+    file: h5py.File, place: str, *, follow_links: bool, per_stored: int, within: h5py.Group | None = None
+) -> h5py.Dataset | None:
     """Return a dataset whose samples lie in its file and can be read, or None if there is none at ``place``.
 
     Parameters
@@ -80,13 +113,15 @@ def find_dataset(file: h5py.File, place: str, *, follow_links: bool, per_stored:
         Whether it may stand, or have its values, in another file.
     per_stored
         `FROM_SAMPLES` or `FROM_TABLE`.
+    within
+        The group that holds it, which spares the way there.
 
     Raises
     ------
     RecordingError
         The values stand in another file; many more are declared than stored; or a filter is missing, which is named.
     """
-    item = find_item(file, place, follow_links=follow_links)
+    item = find_item(file, place, follow_links=follow_links, within=within)
     if not isinstance(item, h5py.Dataset):
         return None
     where = f"{file.filename}: `{place}`"
@@ -96,7 +131,7 @@ def find_dataset(file: h5py.File, place: str, *, follow_links: bool, per_stored:
         raise RecordingError(f"{where} has its values in another file, which is not read; {FOLLOW}")
     for i in range(settings.get_nfilters()):
         _check_filter(where, *settings.get_filter(i)[::3])
-    item_bytes = item.dtype.itemsize
+    item_bytes = item.id.get_type().get_size()
     chunk = math.prod(item.chunks or (0,)) * item_bytes
     if settings.get_nfilters() and chunk > _FILTERED_CHUNK_BYTES:
         raise RecordingError(

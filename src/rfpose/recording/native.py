@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from fractions import Fraction
@@ -104,6 +105,11 @@ class NativeRecording(Recording):
             ) from error
 
 
+@functools.cache
+def _type_of(dtype: np.dtype[Any]) -> h5py.h5t.TypeID:
+    return h5py.h5t.py_create(dtype, logical=True)
+
+
 def _open_hdf5(path: Path) -> h5py.File:
     try:
         if not path.is_file():  # a pipe or a device has no end and no beginning to go back to
@@ -139,6 +145,7 @@ class _Fields:
         self._path = path
         self._file = file
         self._follow_links = follow_links
+        self._receivers: dict[str, h5py.Group] = {}
 
     def error(self, place: str, what: str) -> RecordingError:
         """Build the error for an attribute of the root group."""
@@ -242,8 +249,24 @@ class _Fields:
                 )
         return found
 
-    def _dataset(self, place: str, wanted: str, *, per_stored: int = FROM_TABLE) -> h5py.Dataset:
-        item = find_dataset(self._file, place, follow_links=self._follow_links, per_stored=per_stored)
+    def _receiver(self, receiver_id: str) -> h5py.Group | None:
+        """Return a receiver's group if it is one; found once, since a file may hold hundreds."""
+        if receiver_id not in self._receivers:
+            place = f"/{keys.RECEIVERS}/{receiver_id}"
+            item = find_item(self._file, place, follow_links=self._follow_links, within=self._receivers_of_file)
+            if not isinstance(item, h5py.Group):
+                return None
+            self._receivers[receiver_id] = item
+        return self._receivers[receiver_id]
+
+    @functools.cached_property
+    def _receivers_of_file(self) -> h5py.Group:
+        return self.group(keys.RECEIVERS)
+
+    def _dataset(
+        self, place: str, wanted: str, *, per_stored: int = FROM_TABLE, within: h5py.Group | None = None
+    ) -> h5py.Dataset:
+        item = find_dataset(self._file, place, follow_links=self._follow_links, per_stored=per_stored, within=within)
         if item is None or item.shape is None:
             raise self._missing(place, wanted)
         return item
@@ -251,8 +274,11 @@ class _Fields:
     def iq(self, receiver_id: str, dtype: np.dtype[Any]) -> h5py.Dataset:
         """Return a receiver's samples, of exactly the promised type."""
         place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}"
-        dataset = self._dataset(place, "a dataset of samples", per_stored=FROM_SAMPLES)
-        if dataset.ndim != 1 or dataset.dtype != dtype:
+        dataset = self._dataset(
+            place, "a dataset of samples", per_stored=FROM_SAMPLES, within=self._receiver(receiver_id)
+        )
+        is_same = dataset.id.get_type().equal(_type_of(dtype))  # as numpy's comparison, without making a dtype
+        if dataset.ndim != 1 or not (is_same or dataset.dtype == dtype):
             raise RecordingError(
                 f"{self._path}: `{place}` must be one-dimensional of type {dtype}, is {dataset.ndim}-dimensional of "
                 f"type {dataset.dtype}; {_REMEDY}"
@@ -262,7 +288,7 @@ class _Fields:
     def blocks(self, receiver_id: str, n_stored: int) -> IndexArray:
         """Return (block, 3) rows [start index, count, offset in iq], checked."""
         place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
-        dataset = self._dataset(place, "a table of int64")
+        dataset = self._dataset(place, "a table of int64", within=self._receiver(receiver_id))
         if dataset.ndim != 2 or dataset.shape[1] != 3 or dataset.dtype != np.dtype("<i8"):
             raise RecordingError(
                 f"{self._path}: `{place}` must be int64 of shape (block, 3), is {dataset.dtype} of shape "

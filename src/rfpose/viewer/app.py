@@ -148,8 +148,9 @@ def run(
     theme: str | None = None,
     size: tuple[int, int] | None = None,
     follow_links: bool = False,
+    follow: bool = False,
 ) -> int:
-    """Open the window and return its exit code when it is closed.
+    """Open the window and return its exit code when it is closed; ``follow``: show frames as they come.
 
     Raises
     ------
@@ -171,6 +172,8 @@ def run(
     if size is not None and preferences.geometry() is None:
         window.resize(*size)
     window.show()
-    if path is not None:
+    if path is not None and follow:
+        window.follow_path(path)
+    elif path is not None:
         window.open_path(path, scenario_path=scenario_path, follow_links=follow_links)
     return int(app.exec())

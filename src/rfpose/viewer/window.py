@@ -30,7 +30,7 @@ from rfpose import __version__
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.pipeline.pictures.spectra import prepare
 from rfpose.viewer.preferences import Preferences
-from rfpose.viewer.state.document import Document, open_document
+from rfpose.viewer.state.document import Document, Followed, open_document
 from rfpose.viewer.state.session import Session
 from rfpose.viewer.theme import apply, theme_of
 from rfpose.viewer.views.field import FieldView
@@ -48,6 +48,8 @@ VIEWS: tuple[type[View], ...] = (RecordingView, FieldView, LayoutView, TrackingV
 _FIRST_VIEW = {"recording": "recording", "result": "field", "scenario": "layout", "track": "tracking"}
 _FILES = "All of ours (*.h5 *.hdf5 *.toml *.sigmf-meta *.sigmf-data);;All files (*)"
 _BUSY_AFTER_MS = 250
+_LOOK_MS = 300
+"""Between two looks at a result that is followed."""
 _OFTEN = ("Map", "Getting ready", "Live")
 """Jobs that come with every drag or second: their progress is shown only where they last."""
 _LONG_S = 1.0
@@ -86,6 +88,9 @@ class MainWindow(QMainWindow):
         self.views: dict[str, View] = {}
         self._opening: str | None = None
         self._follow_links = False
+        self._followed: Followed | None = None
+        self._look_timer = QTimer(self, interval=_LOOK_MS)
+        self._look_timer.timeout.connect(self._look)
         self._disconnect: list[Callable[[], None]] = [
             self.session.opened.connect(self._on_opened),
             self.session.said.connect(self._show_message),
@@ -225,6 +230,7 @@ class MainWindow(QMainWindow):
         path = Path(path)
         self._opening = str(path)
         self._follow_links = follow_links
+        self._stop_following()
         self.workers.cancel()
         self.workers.run(
             "Opening",
@@ -246,6 +252,7 @@ class MainWindow(QMainWindow):
 
     def close_document(self) -> None:
         """Go back to the first page."""
+        self._stop_following()
         self.workers.cancel()
         self.session.show(None)
 
@@ -254,23 +261,55 @@ class MainWindow(QMainWindow):
         document = self.session.document
         if document is None:
             return
-        selection = self.session.selection
         path = document.path
-        current = self.current()
-
-        def again(fresh: Document) -> None:
-            self._opened(fresh)
-            self.session.select(
-                receiver=selection.receiver,
-                transmitter=selection.transmitter,
-                frame=selection.frame,
-                heliostat=selection.heliostat,
-            )
-            self.go_to(current)
-
         self.workers.cancel()
         self.workers.run(
-            "Opening", lambda _: open_document(path, follow_links=self._follow_links), again, failed=self._open_failed
+            "Opening",
+            lambda _: open_document(path, follow_links=self._follow_links),
+            self._opened_again,
+            failed=self._open_failed,
+        )
+
+    def _opened_again(self, fresh: Document) -> None:
+        before, selection, current = self.session.document, self.session.selection, self.current()
+        at_end = before is None or selection.frame == before.n_frame - 1
+        if self._followed is None:
+            self._opened(fresh)
+        else:
+            self._opening = None
+            self.session.show(fresh)
+        self.session.select(
+            receiver=selection.receiver,
+            transmitter=selection.transmitter,
+            frame=fresh.n_frame - 1 if self._followed is not None and at_end else selection.frame,
+            heliostat=selection.heliostat,
+        )
+        if before is not None:
+            self.go_to(current)
+
+    # -- a result that is being made ---------------------------------------------------------------------
+
+    def follow_path(self, path: str | Path) -> None:
+        """Show a result and, as they come, its new frames; who looks at the last frame goes on to the next."""
+        self.close_document()
+        self._followed = Followed(path)
+        self._look_timer.start()
+        self.session.tell(f"{path}: waiting for its first frame")
+        self._look()
+
+    def _stop_following(self) -> None:
+        self._followed = None
+        self._look_timer.stop()
+
+    def _look(self) -> None:
+        if self._followed is None or self._opening is not None or not self._followed.has_changed():
+            return
+        path = self._followed.shown
+        if self._followed.complete:
+            self._look_timer.stop()
+        self._opening = str(path)
+        self.workers.run(
+            "Live", lambda _: open_document(path), self._opened_again, key="follow", failed=self._open_failed
         )
 
     def open_example(self) -> None:
@@ -327,7 +366,7 @@ class MainWindow(QMainWindow):
 
     def _file_changed(self, path: str) -> None:
         document = self.session.document
-        if document is None or self._opening is not None:
+        if document is None or self._opening is not None or self._followed is not None:
             return
         if not document.path.exists():
             self.session.tell(

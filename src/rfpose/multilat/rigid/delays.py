@@ -18,13 +18,33 @@ from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.equations import rotate
 
-__all__ = ["LearnedDelays", "learn_delays"]
+__all__ = ["DelayState", "LearnedDelays", "learn_delays"]
 
 UNSEEN_M = 10.0
 """Standard deviation of a difference that nothing has observed yet: 30 ns."""
 
 _JUMP_PROBABILITY = 1e-9
 """Differences rarer than this under prediction and noise mean that a delay has jumped: it is learned anew."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DelayState:
+    """All that the filter keeps of its mirrors between calls.
+
+    Attributes
+    ----------
+    known : (mirror,)
+        Whether a frame was solved.
+    difference_m, difference_cov_m2 : (mirror, difference), (mirror, difference, difference)
+        As in `LearnedDelays`, after the last frame [m].
+    time_s : (mirror,)
+        Of the last frame solved [s].
+    """
+
+    known: npt.NDArray[np.bool_]
+    difference_m: FloatArray
+    difference_cov_m2: FloatArray
+    time_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +64,8 @@ class LearnedDelays:
         Its covariance.
     jumped : (frame, mirror)
         A delay had jumped; it was learned anew from this frame.
+    state
+        To go on from, with the next frames.
     unseen_m
         Standard deviation of differences that nothing has observed yet [m].
     """
@@ -54,6 +76,7 @@ class LearnedDelays:
     difference_m: FloatArray
     difference_cov_m2: FloatArray
     jumped: npt.NDArray[np.bool_]
+    state: DelayState
     unseen_m: float = UNSEEN_M
 
 
@@ -66,6 +89,7 @@ def learn_delays(
     time_s: npt.ArrayLike,
     drift_m_per_sqrt_s: float,
     observed: npt.ArrayLike | None = None,
+    state: DelayState | None = None,
 ) -> LearnedDelays:
     """Filter the clock differences of many mirrors over frames, and refine each frame's pose by them.
 
@@ -83,6 +107,8 @@ def learn_delays(
         Random-walk rate of each receiver's delay [m/√s]; 1 ps/√min is 3.9e-5.
     observed : (frame, mirror, class, receiver), optional
         Which clocks the frame's phases tell of (a carrier without integers tells nothing); default: all.
+    state
+        What an earlier call ended with: one call for all frames equals many calls for a few.
 
     Notes
     -----
@@ -117,9 +143,14 @@ def learn_delays(
     blind = ~(seen_clock[..., :1] & seen_clock[..., 1:]).reshape(n_frame, n_mirror, -1)
     n_difference = len(to_difference)
     limit = float(chdtri(n_difference, _JUMP_PROBABILITY))
-    known = np.zeros(n_mirror, np.bool_)
-    state, spread = np.zeros((n_mirror, n_difference)), np.zeros((n_mirror, n_difference, n_difference))
-    seen_at = np.zeros(n_mirror)
+    before = state or DelayState(
+        known=np.zeros(n_mirror, np.bool_),
+        difference_m=np.zeros((n_mirror, n_difference)),
+        difference_cov_m2=np.zeros((n_mirror, n_difference, n_difference)),
+        time_s=np.zeros(n_mirror),
+    )
+    known, seen_at = before.known.copy(), before.time_s.copy()
+    mean, spread = before.difference_m, before.difference_cov_m2
     out_cov = np.full((n_frame, n_mirror, 6, 6), np.nan)
     out_state = np.full((n_frame, n_mirror, n_difference), np.nan)
     out_spread = np.full((n_frame, n_mirror, n_difference, n_difference), np.nan)
@@ -131,11 +162,11 @@ def learn_delays(
         # what was not observed is held in the pose's covariance: here it is anything, and correlated with nothing
         either = blind[f][:, :, None] | blind[f][:, None, :]
         noise = np.where(either, np.eye(n_difference) * UNSEEN_M**2, noise)
-        measured = np.where(blind[f], state, measured)
+        measured = np.where(blind[f], mean, measured)
         out_cov[f] = whole[f][:, :6, :6]
         predicted = spread + (time[f] - seen_at)[:, None, None] * walk
         both = solved & known
-        innovation = np.where(both[:, None], measured - state, 0.0)
+        innovation = np.where(both[:, None], measured - mean, 0.0)
         total = np.where(both[:, None, None], predicted + noise, np.eye(n_difference))
         weighed = np.linalg.solve(total, innovation[..., None])[..., 0]
         jumped[f] = both & (np.sum(innovation * weighed, axis=1) > limit)
@@ -150,13 +181,13 @@ def learn_delays(
             rot[f, m] = turned
         out_cov[f, use] -= (gain @ with_pose.swapaxes(1, 2))[use]
         kalman = np.where(use[:, None, None], np.linalg.solve(total, predicted).swapaxes(1, 2), 0.0)
-        state = np.where(use[:, None], state + np.einsum("mab,mb->ma", kalman, innovation), state)
+        mean = np.where(use[:, None], mean + np.einsum("mab,mb->ma", kalman, innovation), mean)
         spread = np.where(use[:, None, None], predicted - kalman @ predicted, spread)
         first = solved & ~use
-        state, spread = np.where(first[:, None], measured, state), np.where(first[:, None, None], noise, spread)
+        mean, spread = np.where(first[:, None], measured, mean), np.where(first[:, None, None], noise, spread)
         seen_at[solved] = time[f]
         known |= solved
-        out_state[f, solved], out_spread[f, solved] = state[solved], spread[solved]
+        out_state[f, solved], out_spread[f, solved] = mean[solved], spread[solved]
     return LearnedDelays(
         pivot_enu_m=pivot,
         rot_enu_from_mirror=rot,
@@ -164,4 +195,5 @@ def learn_delays(
         difference_m=out_state,
         difference_cov_m2=out_spread,
         jumped=jumped,
+        state=DelayState(known=known, difference_m=mean, difference_cov_m2=spread, time_s=seen_at),
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from rfpose.errors import RecordingError
 from rfpose.files import make_directory, replace_content
 
-__all__ = ["Entry", "Journal"]
+__all__ = ["Entry", "Journal", "entries_in", "read_entry", "read_key"]
 
 Entry = dict[str, npt.NDArray[Any]]
 
@@ -25,6 +26,36 @@ _KEY_NAME = "key.json"
 _ENTRY_NAME = re.compile(r"rows-(\d{12})-(\d{12})\.npz")
 
 _log = logging.getLogger(__name__)
+
+
+def read_key(directory: Path) -> dict[str, str] | None:
+    """Return what the entries of a directory depend on; None: it is no journal."""
+    try:
+        found = json.loads((directory / _KEY_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def entries_in(directory: Path) -> list[tuple[int, int, Path]]:
+    """Return ``(first row, end row, file)`` of a journal's entries from row zero on, as far as there is no gap.
+
+    Of entries that begin with the same row the longest: it was made of the others, which a killed job left.
+    """
+    found = [(int(m[1]), int(m[2]), m[0]) for name in os.listdir(directory) if (m := _ENTRY_NAME.fullmatch(name))]
+    longest = {first: (end, name) for first, end, name in sorted(found)}
+    entries, row = [], 0
+    while row in longest and longest[row][0] > row:
+        end, name = longest[row]
+        entries.append((row, end, directory / name))
+        row = end
+    return entries
+
+
+def read_entry(path: Path) -> Entry:
+    """Return the arrays of one entry; OSError, ValueError, EOFError or BadZipFile: it is damaged or gone."""
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
 
 
 class Journal:
@@ -47,7 +78,7 @@ class Journal:
 
     def __init__(self, directory: Path, key: Mapping[str, str], *, restart: bool) -> None:
         self._directory = directory
-        found = self._read_key()
+        found = read_key(directory)
         if found is None:
             self._refuse_strangers()
         elif found != dict(key):
@@ -60,13 +91,6 @@ class Journal:
             self.remove()
         make_directory(directory)
         replace_content(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())
-
-    def _read_key(self) -> dict[str, str] | None:
-        try:
-            found = json.loads((self._directory / _KEY_NAME).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return found if isinstance(found, dict) else None
 
     def _refuse_strangers(self) -> None:
         """Without a key, only what a job leaves that was killed while it wrote the key may be there."""
@@ -85,19 +109,12 @@ class Journal:
         A damaged entry is one that a power cut left incomplete; its rows are measured again.
         """
         entries: list[tuple[int, int, Entry]] = []
-        end = 0
-        for path in sorted(self._directory.glob("rows-*.npz")):
-            match = _ENTRY_NAME.fullmatch(path.name)
-            if match is None or int(match[1]) != end:
-                break
+        for first, end, path in entries_in(self._directory):
             try:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                    arrays = {name: stored[name] for name in stored.files}
+                entries.append((first, end, read_entry(path)))
             except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 _log.warning("%s is damaged (%s); that part is measured again", path, error)
                 break
-            entries.append((end, int(match[2]), arrays))
-            end = int(match[2])
         return entries
 
     def append(self, first_row: int, end_row: int, arrays: Entry) -> None:
@@ -105,6 +122,12 @@ class Journal:
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)  # type: ignore[arg-type]
         replace_content(self._directory / f"rows-{first_row:012d}-{end_row:012d}.npz", buffer.getvalue())
+
+    def merge(self, entries: Sequence[tuple[int, int, Path]], arrays: Entry) -> None:
+        """Put one entry in place of several that follow each other; they go when it is there."""
+        self.append(entries[0][0], entries[-1][1], arrays)
+        for _, _, path in entries:
+            path.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete the entries and, unless something else is in it, the directory."""

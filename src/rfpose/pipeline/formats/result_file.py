@@ -66,6 +66,7 @@ __all__ = [
     "is_result",
     "labels_of",
     "open_result",
+    "result_of",
     "write_result",
 ]
 
@@ -188,6 +189,8 @@ OPTIONAL: Mapping[str, type[Any]] = {
 }
 """Groups that are there where the estimator of poses makes them."""
 
+_ALWAYS = ("tones", "calibration", "ranges", "fixes", "poses")
+
 _TRANSMITTER_INDEX = ("ranges/reference", "integrity/worst_transmitter")
 
 
@@ -288,7 +291,7 @@ def is_result(path: str | Path) -> bool:
 
 
 def open_result(path: str | Path) -> Result:
-    """Read a result.
+    """Read a result, or the frames so far of one that is being made (``RESULT.partial`` of `rfpose process --follow`).
 
     Raises
     ------
@@ -302,11 +305,53 @@ def open_result(path: str | Path) -> Result:
     >>> rf.open_result("result.h5").to_pandas()  # doctest: +SKIP
     """
     path = Path(path)
+    if path.is_dir():
+        from rfpose.pipeline.formats.live_result import open_live
+
+        return open_live(path)
     with opened(path, wanted="result", version=VERSION, again=_AGAIN) as file:
         return _Reader(path, file, length=FIXED, again=_AGAIN).result()
 
 
 _AGAIN = "run `rfpose process` again"
+
+
+def result_of(
+    scenario: Scenario,
+    settings: Mapping[str, str],
+    columns: Mapping[str, npt.NDArray[Any]],
+    *,
+    truth: Truth | None = None,
+) -> Result:
+    """Return a result made of the columns of `KEYS`; the inverse of `columns_of`."""
+
+    def group(name: str) -> dict[str, npt.NDArray[Any]]:
+        return {key: columns[f"{name}/{key}"] for key in _group_keys(name)}
+
+    return Result(
+        scenario=scenario,
+        sample_rate=rate_of(settings),
+        choice=PoseChoice.of(settings, scenario),
+        settings=settings,
+        frame_start_index=columns["frames/start_index"],
+        tones=TonePhases(
+            **group("tones"),
+            receiver_ids=scenario.receiver_ids,
+            transmitter_ids=scenario.transmitter_ids,
+            tone_hz=scenario.tone_hz,
+            frame_start_index=columns["frames/start_index"],
+        ),
+        calibration=PhaseCalibration(**group("calibration")),
+        ranges=RangeDifferences(**group("ranges")),
+        fixes=FixTable(**group("fixes")),
+        poses=PoseTable(**group("poses")),
+        **{
+            name: record(**group(name))
+            for name, record in OPTIONAL.items()
+            if f"{name}/{_group_keys(name)[0]}" in columns
+        },
+        truth=truth,
+    )
 
 
 class _Reader(FileReader):
@@ -321,31 +366,13 @@ class _Reader(FileReader):
             "heliostat": len(scenario.heliostat_ids),
             "ray_kind": len(RayKind),
         }
-        settings, sample_rate, choice = self._settings(scenario)
-        start_index = self._start_index(sample_rate)
-        tones = self._group("tones")
-        return Result(
-            scenario=scenario,
-            sample_rate=sample_rate,
-            choice=choice,
-            settings=settings,
-            frame_start_index=start_index,
-            tones=TonePhases(
-                **tones,
-                receiver_ids=scenario.receiver_ids,
-                transmitter_ids=scenario.transmitter_ids,
-                tone_hz=scenario.tone_hz,
-                frame_start_index=start_index,
-            ),
-            calibration=PhaseCalibration(**self._group("calibration")),
-            ranges=RangeDifferences(**self._group("ranges")),
-            fixes=FixTable(**self._group("fixes")),
-            poses=PoseTable(**self._group("poses")),
-            **{name: record(**self._group(name)) for name, record in OPTIONAL.items() if name in self.file},
-            truth=self._truth(scenario),
-        )
+        settings, sample_rate = self._settings(scenario)
+        columns = {"frames/start_index": self._start_index(sample_rate)}
+        for group in (*_ALWAYS, *(name for name in OPTIONAL if name in self.file)):
+            columns |= {f"{group}/{name}": values for name, values in self._group(group).items()}
+        return result_of(scenario, settings, columns, truth=self._truth(scenario))
 
-    def _settings(self, scenario: Scenario) -> tuple[dict[str, str], Fraction, PoseChoice]:
+    def _settings(self, scenario: Scenario) -> tuple[dict[str, str], Fraction]:
         group = find_item(self.file, "/settings", follow_links=False)
         found = dict(group.attrs.items()) if isinstance(group, h5py.Group) else {}
         for name, value in found.items():
@@ -355,7 +382,8 @@ class _Reader(FileReader):
             if name not in found:
                 raise self.error("settings", f"is missing or lacks `{name}`")
         try:
-            return found, rate_of(found), PoseChoice.of(found, scenario)
+            PoseChoice.of(found, scenario)
+            return found, rate_of(found)
         except RfposeError as error:
             raise self.error("settings", f"cannot be: {error}") from error
 

@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from datetime import datetime
+from time import sleep
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rfpose.interruption import check
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.integrity import IntegrityStatus
 from rfpose.pipeline.formats.result import frame_time
 
 if TYPE_CHECKING:
+    from rfpose.pipeline.formats.live_result import ResultFollower
     from rfpose.pipeline.formats.result import Result
 
-__all__ = ["QUANTITIES", "SCHEMA", "SCHEMA_NAME", "VOUCHED", "messages"]
+__all__ = ["LOOK_S", "QUANTITIES", "SCHEMA", "SCHEMA_NAME", "VOUCHED", "messages", "messages_as_they_come"]
+
+LOOK_S = 0.05
+"""Between two looks at a result that is followed."""
 
 SCHEMA_NAME = "rfpose-pose/1"
 QUANTITIES: dict[str, tuple[str, str]] = {
@@ -68,7 +74,7 @@ SCHEMA: dict[str, Any] = {
 """JSON Schema of a message; ``unit`` says what a number is in."""
 
 
-def messages(result: Result, first_frame: int = 0) -> Iterator[dict[str, Any]]:
+def messages(result: Result, first_frame: int = 0, *, number_from: int = 0) -> Iterator[dict[str, Any]]:
     """Yield what is told of each mirror, frame by frame; a number that is not known is None, and ``why_null`` says why.
 
     Parameters
@@ -77,6 +83,8 @@ def messages(result: Result, first_frame: int = 0) -> Iterator[dict[str, Any]]:
         Of `rfpose.process`.
     first_frame
         Where to begin.
+    number_from
+        Number of the result's first frame, which may be one of those that follow others.
     """
     poses, tested = result.poses, result.integrity
     for i_frame in range(first_frame, len(result.frame_start_index)):
@@ -101,13 +109,37 @@ def messages(result: Result, first_frame: int = 0) -> Iterator[dict[str, Any]]:
             yield {
                 "schema": SCHEMA_NAME,
                 "heliostat": name,
-                "frame": i_frame,
+                "frame": number_from + i_frame,
                 "time_utc": _iso(time),
                 "status": status,
                 "integrity": integrity,
                 **{key: None if key in why else value for key, value in values.items()},
                 "why_null": why,
             }
+
+
+def messages_as_they_come(follower: ResultFollower) -> Iterator[dict[str, Any]]:
+    """Yield what `messages` does of each frame that comes, until the result is complete.
+
+    Parameters
+    ----------
+    follower
+        Says which frames are new.
+
+    Raises
+    ------
+    RecordingError
+        The result is damaged, or another one stands in its place.
+    """
+    while True:
+        found = follower.news()
+        if found is not None:
+            yield from messages(found, number_from=follower.n_seen - len(found.frame_start_index))
+        elif follower.complete:
+            return
+        else:
+            check()
+            sleep(LOOK_S)
 
 
 def _iso(time: datetime) -> str:

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import hmac
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from rfpose.errors import InvalidInputError, PublishError, install_remedy
 from rfpose.pipeline.publish.address import address_of
-from rfpose.pipeline.publish.messages import QUANTITIES, VOUCHED, messages
+from rfpose.pipeline.publish.messages import LOOK_S, QUANTITIES, VOUCHED, messages
 
 if TYPE_CHECKING:
+    from rfpose.pipeline.formats.live_result import ResultFollower
     from rfpose.pipeline.formats.result import Result
 
-__all__ = ["NAMESPACE", "PlantServer", "serve", "serving"]
+__all__ = ["NAMESPACE", "PlantServer", "serve", "serve_as_they_come", "serving"]
 
 NAMESPACE = "urn:rfpose:poses"
 
@@ -103,17 +104,56 @@ def serve(result: Result, to: PlantServer, *, on_ready: Callable[[str], None] | 
     asyncio.run(run())
 
 
+def serve_as_they_come(
+    follower: ResultFollower, to: PlantServer, *, on_ready: Callable[[str], None] | None = None
+) -> None:
+    """Let clients read the newest frame of a result that is being made, until interrupted.
+
+    Parameters
+    ----------
+    follower
+        Says which frames are new; the server begins with the first.
+    to, on_ready
+        As for `serve`.
+
+    Raises
+    ------
+    PublishError
+        As `serve`.
+    RecordingError
+        The result is damaged, or another one stands in its place.
+    """
+
+    async def run() -> None:
+        while (first := await asyncio.to_thread(follower.news)) is None:
+            await asyncio.sleep(LOOK_S)
+        async with serving(first, to) as show:
+            if on_ready is not None:
+                on_ready(to.url)
+            while True:
+                found = None if follower.complete else await asyncio.to_thread(follower.news)
+                if found is not None:
+                    await show(found)
+                await asyncio.sleep(LOOK_S)
+
+    asyncio.run(run())
+
+
 @contextlib.asynccontextmanager
-async def serving(result: Result, to: PlantServer) -> AsyncIterator[None]:
-    """Serve as `serve` does, for a program with an event loop of its own, while the block lasts."""
+async def serving(result: Result, to: PlantServer) -> AsyncIterator[Callable[[Result], Awaitable[None]]]:
+    """Serve as `serve` does, for a program with an event loop of its own, while the block lasts.
+
+    What it yields shows the last frame of another result of the same mirrors.
+    """
     try:
         import asyncua  # noqa: F401
     except ImportError as error:
         raise PublishError(f"OPC UA needs asyncua; {install_remedy('publish')}") from error
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     async with _listening(to) as server:
-        await _show(server, result)
-        yield
+        shown = _Shown()
+        await shown.make(server, result)
+        yield shown.show
 
 
 @contextlib.asynccontextmanager
@@ -163,37 +203,53 @@ async def _listening(to: PlantServer) -> AsyncIterator[Any]:
         await server.stop()
 
 
-async def _show(server: Any, result: Result) -> None:
-    """Make an object for each heliostat, and fill it with the last frame."""
-    from asyncua import ua
+class _Shown:
+    """An object for each heliostat, with variables that hold its last frame."""
 
-    space = await server.register_namespace(NAMESPACE)
-    field = await server.nodes.objects.add_folder(space, "Heliostats")
-    for message in messages(result, len(result.frame_start_index) - 1):
-        name = message["heliostat"]
-        mirror = await field.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
-        time = datetime.fromisoformat(message["time_utc"]).astimezone(UTC)
-        for key, variable in _VARIABLES.items():
-            unit, text = QUANTITIES[key]
-            node = await mirror.add_variable(
-                ua.NodeId(f"{name}.{variable}", space),
-                ua.QualifiedName(variable, space),
-                [0.0] * 3 if key == "normal_enu" else 0.0,
-                ua.VariantType.Double,
-            )
-            await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(text)))
-            await node.add_property(
-                ua.NodeId(f"{name}.{variable}.EngineeringUnits", space),
-                ua.QualifiedName("EngineeringUnits", 0),
-                ua.EUInformation(DisplayName=ua.LocalizedText(unit)),
-            )
-            await node.write_value(_data_value(message, key, time))
-        for key, variable in (("status", "Status"), ("integrity", "Integrity")):
-            node = await mirror.add_variable(
-                ua.NodeId(f"{name}.{variable}", space), ua.QualifiedName(variable, space), "", ua.VariantType.String
-            )
-            value = ua.Variant(message[key] or "not tested", ua.VariantType.String)
-            await node.write_value(ua.DataValue(value, SourceTimestamp=time))
+    def __init__(self) -> None:
+        self._nodes: dict[tuple[str, str], Any] = {}
+        """By heliostat and key of a message."""
+
+    async def make(self, server: Any, result: Result) -> None:
+        """Make the objects, and fill them."""
+        from asyncua import ua
+
+        space = await server.register_namespace(NAMESPACE)
+        field = await server.nodes.objects.add_folder(space, "Heliostats")
+        for name in result.scenario.heliostat_ids:
+            mirror = await field.add_object(ua.NodeId(name, space), ua.QualifiedName(name, space))
+            for key, variable in _VARIABLES.items():
+                unit, text = QUANTITIES[key]
+                node = self._nodes[name, key] = await mirror.add_variable(
+                    ua.NodeId(f"{name}.{variable}", space),
+                    ua.QualifiedName(variable, space),
+                    [0.0] * 3 if key == "normal_enu" else 0.0,
+                    ua.VariantType.Double,
+                )
+                await node.write_attribute(ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(text)))
+                await node.add_property(
+                    ua.NodeId(f"{name}.{variable}.EngineeringUnits", space),
+                    ua.QualifiedName("EngineeringUnits", 0),
+                    ua.EUInformation(DisplayName=ua.LocalizedText(unit)),
+                )
+            for key, variable in (("status", "Status"), ("integrity", "Integrity")):
+                self._nodes[name, key] = await mirror.add_variable(
+                    ua.NodeId(f"{name}.{variable}", space), ua.QualifiedName(variable, space), "", ua.VariantType.String
+                )
+        await self.show(result)
+
+    async def show(self, result: Result) -> None:
+        """Fill the objects with a result's last frame."""
+        from asyncua import ua
+
+        for message in messages(result, len(result.frame_start_index) - 1):
+            name = message["heliostat"]
+            time = datetime.fromisoformat(message["time_utc"]).astimezone(UTC)
+            for key in _VARIABLES:
+                await self._nodes[name, key].write_value(_data_value(message, key, time))
+            for key in ("status", "integrity"):
+                value = ua.Variant(message[key] or "not tested", ua.VariantType.String)
+                await self._nodes[name, key].write_value(ua.DataValue(value, SourceTimestamp=time))
 
 
 def _data_value(message: Mapping[str, Any], key: str, time: datetime) -> Any:

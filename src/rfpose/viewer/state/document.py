@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from rfpose.errors import RfposeError
 from rfpose.kinds import kind_of
+from rfpose.pipeline.formats.live_result import is_live, n_frame_in, open_live, partial_of
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.track_file import is_track, open_track
@@ -20,7 +21,10 @@ from rfpose.pipeline.pictures.track_view import TrackPicture, picture_of_track, 
 from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario, load_scenario
 
-__all__ = ["Document", "Kind", "open_document"]
+__all__ = ["NEWEST_FRAMES", "Document", "Followed", "Kind", "open_document"]
+
+NEWEST_FRAMES = 500
+"""Of a result that is being made, so many are shown."""
 
 Kind = Literal["recording", "result", "scenario", "track"]
 
@@ -74,13 +78,44 @@ class Document:
             self.recording.close()
 
 
+class Followed:
+    """A result that is being made: where it can be read now, and whether there is more than at the last look.
+
+    Attributes
+    ----------
+    shown
+        What to open.
+    complete
+        It is no longer being made.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+        self._partial = self._path if is_live(self._path) else partial_of(self._path)
+        self._seen: tuple[str, int] | None = None
+        self.shown = self._path
+        self.complete = False
+
+    def has_changed(self) -> bool:
+        """Look; true once for each change."""
+        n_frame = n_frame_in(self._partial)
+        self.complete = not self._partial.exists() and self._path.is_file()
+        if not n_frame and not self.complete:
+            return False
+        self.shown = self._path if self.complete else self._partial
+        seen = (str(self.shown), n_frame)
+        changed, self._seen = seen != self._seen, seen
+        return changed
+
+
 def open_document(path: str | Path, *, scenario_path: str | Path | None = None, follow_links: bool = False) -> Document:
     """Open whatever of ours a path holds.
 
     Parameters
     ----------
     path
-        A scenario (.toml), a result, a tracking run, or a recording in any format.
+        A scenario (.toml), a result, also one that is being made (``RESULT.partial``), a tracking run, or a
+        recording in any format.
     scenario_path
         Site of a recording that brings none; wins over its own.
     follow_links
@@ -99,6 +134,8 @@ def open_document(path: str | Path, *, scenario_path: str | Path | None = None, 
         )
     if path.is_file() and is_result(path):
         return _result(path)
+    if is_live(path):
+        return _growing(path)
     if path.is_file() and is_track(path):
         track = open_track(path)
         site = site_of_run(track)
@@ -141,6 +178,18 @@ def _recording(recording: Recording) -> Document:
     except BaseException:
         recording.close()
         raise
+
+
+def _growing(path: Path) -> Document:
+    result = open_live(path, max(0, n_frame_in(path) - NEWEST_FRAMES))
+    return Document(
+        path=path,
+        kind="result",
+        scenario=result.scenario,
+        field=field_of_result(result),
+        frame_start_index=_none(),
+        result=result,
+    )
 
 
 def _result(path: Path) -> Document:

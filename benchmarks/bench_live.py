@@ -1,0 +1,148 @@
+"""A recording that is followed: how soon after a frame's last sample its poses are there, and what a day does to it.
+
+    python benchmarks/bench_live.py [--receivers 300] [--samples 100000] [--frames 30] [--estimator correlator]
+    python benchmarks/bench_live.py --day [--every 60]
+
+A recorder in a process of its own writes a closed rfpose-iq file a frame. A frame's last sample is there when its file
+takes its name; its poses are there when who reads ``RESULT.partial`` finds them. With ``--day``, 24 hours pass with a
+small frame every so many seconds, as fast as they are solved: memory and latency of each tenth, and frames lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import multiprocessing
+import os
+import tempfile
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+import rfpose as rf
+from rfpose.pipeline.follow import Follow
+from rfpose.pipeline.formats.result import Result
+from rfpose.recording import Recording, RecordingWriter
+from rfpose.scenario import Scenario
+
+DAY_S = 86_400
+KEPT = 50
+"""Files that the recorder leaves; it removes older ones."""
+
+
+def site_of(n_receiver: int, n_sample: int) -> Scenario:
+    """Table 2's transmitters, so many receivers on mirrors of three, and its calibration receiver."""
+    shipped = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
+    n_mirror = max(1, n_receiver // 3)
+    k = np.arange(n_mirror) + 0.5
+    radius, angle = 15.0 + 75.0 * np.sqrt(k / n_mirror), 2.399963 * k
+    places = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(n_mirror, 2.0)], axis=1)
+    return shipped.with_field(places).changed(radio={"frame_samples": n_sample}, simulation={"frame_count": 1})
+
+
+def record(
+    folder: Path, recording: Recording, samples: dict[str, np.ndarray], steps: list[int], told: Connection
+) -> None:
+    """Write a file a frame, each when it is asked for, and tell when it was there."""
+    start = int(recording.blocks(recording.receiver_ids[0])[0, 0])
+    for k, step in enumerate(steps):
+        told.recv()
+        begun = time.time()
+        with RecordingWriter(
+            folder / f"frame-{k:06d}.h5",
+            scenario=recording.scenario,
+            receiver_ids=recording.receiver_ids,
+            sample_rate=recording.sample_rate,
+            centre_frequency_hz=recording.centre_frequency_hz,
+            sample_format=recording.sample_format,
+            full_scale=recording.full_scale,
+            provenance={},
+        ) as writer:
+            for name, iq in samples.items():
+                writer.write(name, start + step, iq)
+        told.send((time.time(), time.time() - begun))
+        if k >= KEPT:
+            (folder / f"frame-{k - KEPT:06d}.h5").unlink()
+
+
+def memory_mb() -> float:
+    """Return the resident memory of this process [MB]."""
+    text = Path("/proc/self/statm").read_text()
+    return int(text.split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def main() -> None:
+    """Print latencies."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--receivers", type=int, default=300)
+    parser.add_argument("--samples", type=int, default=100_000)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--estimator", default="correlator")
+    parser.add_argument("--day", action="store_true")
+    parser.add_argument("--every", type=int, default=60, help="seconds between two frames of the day")
+    asked = parser.parse_args()
+    logging.getLogger("rfpose").setLevel(logging.ERROR)
+    if asked.day:
+        asked.receivers, asked.samples, asked.frames = 3, 20_000, DAY_S // asked.every
+    site = site_of(asked.receivers, asked.samples)
+    recording = rf.simulate(site, seed=1)
+    start = int(recording.blocks(recording.receiver_ids[0])[0, 0])
+    samples = {name: recording.read(name, start, asked.samples) for name in recording.receiver_ids}
+    every = int(asked.every * recording.sample_rate) if asked.day else 10 * asked.samples
+    here, there = multiprocessing.Pipe()
+    latency_s: list[float] = []
+    memory: list[float] = []
+    writing_s: list[float] = []
+    spent_s: list[float] = []
+
+    def on_frame(_result: Result) -> None:
+        seen = time.time()
+        at, took = here.recv()
+        latency_s.append(seen - at)
+        writing_s.append(took)
+        memory.append(memory_mb())
+        spent_s.append(time.process_time())
+        if len(latency_s) < asked.frames:
+            here.send(None)
+
+    with tempfile.TemporaryDirectory() as folder:
+        night = Path(folder) / "night"
+        night.mkdir()
+        steps = [k * every for k in range(asked.frames)]
+        until_s = (start + steps[-1] + every) / recording.sample_rate
+        recorder = multiprocessing.Process(target=record, args=(night, recording, samples, steps, there))
+        recorder.start()
+        here.send(None)
+        began = time.time()
+        result = rf.process(
+            night,
+            Path(folder) / "result.h5",
+            estimator=asked.estimator,
+            follow=Follow(idle_timeout_s=30.0, until_s=until_s, on_frame=on_frame),
+        )
+        lasted_s = time.time() - began
+        recorder.join(30.0)
+        recorder.kill()
+    n_receiver = len(site.receiver_ids)
+    print(
+        f"{n_receiver} receivers, {len(site.heliostat)} mirrors, {asked.samples} samples a frame, {asked.estimator}, "
+        f"{len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}"
+    )
+    print(f"frames written {asked.frames}, solved {len(result.frame_start_index)}, in {lasted_s:.0f} s")
+    print(f"poses solved {np.count_nonzero(result.poses.status == 0)} of {result.poses.status.size}")
+    later = np.array(latency_s[1:])
+    print(f"writing a frame's file: median {1e3 * np.median(writing_s):.0f} ms")
+    print(
+        f"latency after the first frame: median {1e3 * np.median(later):.0f} ms, "
+        f"95 % {1e3 * np.quantile(later, 0.95):.0f} ms, worst {1e3 * later.max():.0f} ms"
+    )
+    print(f"processor time a frame, both cores together: median {1e3 * np.median(np.diff(spent_s)):.0f} ms")
+    for k, (times, sizes) in enumerate(zip(np.array_split(later, 10), np.array_split(memory[1:], 10), strict=True)):
+        if asked.day:
+            print(f"  tenth {k + 1:2d}: latency median {1e3 * np.median(times):5.1f} ms, memory {sizes[-1]:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()
