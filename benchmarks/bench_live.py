@@ -117,10 +117,9 @@ def main() -> None:
         here.send(None)
         began = time.time()
         result = rf.process(
-            night,
+            Follow(night, idle_timeout_s=30.0, until_s=until_s, on_frame=on_frame),
             Path(folder) / "result.h5",
             estimator=asked.estimator,
-            follow=Follow(idle_timeout_s=30.0, until_s=until_s, on_frame=on_frame),
         )
         lasted_s = time.time() - began
         recorder.join(30.0)

@@ -89,7 +89,7 @@ def test_a_followed_recording_gives_the_same_bytes_and_is_read_meanwhile(
         recorder.put()
 
     recorder.put(2)
-    rf.process(recorder.to, output, follow=Follow(idle_timeout_s=0.3, on_frame=on_frame))
+    rf.process(Follow(recorder.to, idle_timeout_s=0.3, on_frame=on_frame), output)
     assert output.read_bytes() == plain
     assert not partial_of(output).exists()
     whole = rf.open_result(output)
@@ -120,7 +120,7 @@ def test_an_interrupted_one_goes_on_and_another_recording_is_refused(night: Path
 
     recorder.put(4)
     with pytest.raises(KeyboardInterrupt):
-        rf.process(recorder.to, output, follow=Follow(on_frame=stop))
+        rf.process(Follow(recorder.to, on_frame=stop), output)
     assert not output.exists()
     assert len(rf.open_result(partial_of(output)).frame_start_index) == 3
     # the recorder has removed what it wrote first; what was measured of it stays
@@ -133,13 +133,13 @@ def test_an_interrupted_one_goes_on_and_another_recording_is_refused(night: Path
     (other.rename(tmp_path / "night2"), recorder.to.rename(tmp_path / "aside"))
     (tmp_path / "night2").rename(tmp_path / "night")
     with pytest.raises(RecordingError, match="another job"):
-        rf.process(tmp_path / "night", output, follow=Follow(idle_timeout_s=0.3))
+        rf.process(Follow(tmp_path / "night", idle_timeout_s=0.3), output)
     shutil.rmtree(tmp_path / "night")
     (tmp_path / "aside").rename(tmp_path / "night")
     recorder.put(2)
     (tmp_path / "night" / "frame-000001.h5").unlink()
     more: list[Result] = []
-    rf.process(tmp_path / "night", output, follow=Follow(idle_timeout_s=0.3, on_frame=more.append))
+    rf.process(Follow(tmp_path / "night", idle_timeout_s=0.3, on_frame=more.append), output)
     assert len(more) == N_FRAME - 3
     found, wanted = rf.open_result(output), rf.open_result(night.parent / "plain.h5")
     np.testing.assert_array_equal(found.tones.phase_rad, wanted.tones.phase_rad)
@@ -160,7 +160,7 @@ def test_what_is_damaged_late_or_goes_back_is_left_out_and_told(
     (recorder.to / names[0]).rename(tmp_path / "first")
     shutil.copyfile(tmp_path / "first", recorder.to / names[0])
     shutil.copyfile(tmp_path / "first", recorder.to / "frame-000003b.h5")
-    result = rf.process(recorder.to, tmp_path / "r.h5", follow=Follow(idle_timeout_s=0.5, lateness_s=0.05))
+    result = rf.process(Follow(recorder.to, idle_timeout_s=0.5, lateness_s=0.05), tmp_path / "r.h5")
     wanted = rf.open_result(night.parent / "plain.h5").frame_start_index
     np.testing.assert_array_equal(result.frame_start_index, np.delete(wanted, 1))
     row = result.scenario.receiver_ids.index("H02_r1")
@@ -205,7 +205,7 @@ def test_digital_rf_is_followed_while_it_is_written(night: Path, site: Scenario,
                 (grown / file.relative_to(whole)).parent.mkdir(exist_ok=True)
                 shutil.copyfile(file, grown / file.relative_to(whole))
 
-    found = rf.process(grown, tmp_path / "r.h5", follow=Follow(idle_timeout_s=0.5, on_frame=on_frame))
+    found = rf.process(Follow(grown, idle_timeout_s=0.5, on_frame=on_frame), tmp_path / "r.h5")
     np.testing.assert_array_equal(found.frame_start_index, wanted.frame_start_index)
     np.testing.assert_array_equal(found.tones.status, wanted.tones.status)
     np.testing.assert_array_equal(found.tones.phase_rad, wanted.tones.phase_rad)
@@ -213,11 +213,11 @@ def test_digital_rf_is_followed_while_it_is_written(night: Path, site: Scenario,
 
 def test_wrong_calls_and_silence_are_one_line(night: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="needs `output`"):
-        rf.process(night, follow=Follow())
-    with pytest.raises(InvalidInputError, match="path of one recording"):
-        rf.process([night, night], tmp_path / "r.h5", follow=Follow())
+        rf.process(Follow(night))
     with pytest.raises(InvalidInputError, match="`idle_timeout_s` must be greater than zero"):
-        Follow(idle_timeout_s=0.0)
+        Follow(night, idle_timeout_s=0.0)
+    two = CliRunner().invoke(app, ["process", str(night), str(night), "-o", "r.h5", "--follow"])
+    assert (two.exit_code, "takes one RECORDING" in two.stderr) == (2, True)
     words = ["process", str(tmp_path / "nix"), "-o", str(tmp_path / "r.h5"), "--follow", "--idle-timeout", "0.2"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 3
@@ -240,7 +240,7 @@ def test_many_frames_become_few_files_that_read_the_same(
         assert len(open_live(partial_of(output)).frame_start_index) == len(counts)
 
     monkeypatch.setattr(follow._Grid, "frames", _tidied(follow._Grid.frames))
-    rf.process(night, output, follow=Follow(idle_timeout_s=0.3, on_frame=on_frame))
+    rf.process(Follow(night, idle_timeout_s=0.3, on_frame=on_frame), output)
     assert counts == [1, 2, 3, 2, 3, 4]
     assert output.read_bytes() == plain
 

@@ -668,11 +668,11 @@ def test_a_result_that_is_made_is_followed_to_its_end(window, wait, files: dict[
     window.follow_path(output)
     assert "waiting for its first frame" in window.session.message.text
     with pytest.raises(KeyboardInterrupt):
-        process(files["recording"], output, follow=Follow(on_frame=stop_after_two))
+        process(Follow(files["recording"], on_frame=stop_after_two), output)
     wait(window, lambda: window.session.document is not None)
     assert (window.session.document.n_frame, window.session.selection.frame) == (2, 1)
     window.session.select(heliostat=1)
-    process(files["recording"], output, follow=Follow())
+    process(Follow(files["recording"]), output)
     wait(window, lambda: window.session.document.path == output)
     assert (window.session.document.n_frame, window.session.selection.frame) == (3, 2)
     assert window.session.selection.heliostat == 1

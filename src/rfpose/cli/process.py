@@ -180,7 +180,7 @@ def command(
     with claimed, contextlib.ExitStack() as open_files:
         on_progress = None if following.follow else open_files.enter_context(progress("Measuring"))
         check_table(tables.parquet, ".parquet")
-        given: Any = recording
+        given: Any = _follow(recording, following, output, session, is_declared=declared is not None) or recording
         if declared is not None:
             given = open_files.enter_context(
                 rfpose.open_recording(recording, declared=declared, follow_links=follow_links)
@@ -190,7 +190,6 @@ def command(
             output,
             scenario=scenario,
             **asdict(how),
-            follow=_follow(following, output, session, is_declared=declared is not None),
             follow_links=follow_links,
             force=force,
             on_progress=on_progress,
@@ -224,7 +223,9 @@ def command(
         _say_profile(result.profile)
 
 
-def _follow(following: _Following, output: Path, session: CommonOptions, *, is_declared: bool) -> Follow | None:
+def _follow(
+    recording: tuple[Path, ...], following: _Following, output: Path, session: CommonOptions, *, is_declared: bool
+) -> Follow | None:
     """Return how the recording is followed; None: it is complete."""
     context = click.get_current_context()
     if not following.follow:
@@ -234,6 +235,8 @@ def _follow(following: _Following, output: Path, session: CommonOptions, *, is_d
         return None
     if is_declared:
         raise click.UsageError("--follow reads Digital RF and rfpose-iq; leave --format out")
+    if len(recording) > 1:
+        raise click.UsageError("--follow takes one RECORDING; let the recorders write into one directory")
     session.when_interrupted = (
         f"interrupted; frames so far are in {output}.partial, and the same command goes on where it stopped"
     )
@@ -241,6 +244,7 @@ def _follow(following: _Following, output: Path, session: CommonOptions, *, is_d
     from rfpose.recording.declared import seconds_of
 
     return Follow(
+        recording[0],
         idle_timeout_s=following.idle_timeout_s,
         until_s=None if following.until is None else seconds_of(following.until, "`until`"),
         lateness_s=following.lateness_s,

@@ -8,7 +8,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Final
@@ -34,7 +34,6 @@ from rfpose.pipeline.solve import no_calibration, solve, solve_calibrated
 from rfpose.recording import (
     GapError,
     Recording,
-    RecordingSource,
     frame_starts,
     note_doubts,
     open_recording,
@@ -55,12 +54,14 @@ _REMEMBERED: Final = 32
 _PROBE_SAMPLES: Final = 1024
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Follow:
-    """How a recording that is being written is followed.
+    """A recording that is being written, and how it is followed.
 
     Attributes
     ----------
+    path
+        Of one recording: a Digital RF directory, or a directory of closed rfpose-iq files; it may appear later.
     idle_timeout_s
         The recording has ended when nothing came for so long [s]; None: only an interruption or ``until_s`` ends it.
     until_s
@@ -76,6 +77,8 @@ class Follow:
         A time that is not greater than zero.
     """
 
+    path: str | Path
+    _: KW_ONLY
     idle_timeout_s: float | None = 60.0
     until_s: Fraction | None = None
     lateness_s: float = 1.0
@@ -89,10 +92,9 @@ class Follow:
 
 
 def follow_recording(
-    recording: Recording | RecordingSource,
+    follow: Follow,
     output: str | Path | None,
     asked: Asked,
-    follow: Follow,
     *,
     follow_links: bool,
     force: bool,
@@ -101,14 +103,12 @@ def follow_recording(
 
     Parameters
     ----------
-    recording
-        Path of one recording; it may appear later.
+    follow
+        The recording, when to end, and for whom to wait.
     output, follow_links, force
         As for `rfpose.process`; there must be an output.
     asked
         What is to be made of it.
-    follow
-        When to end, and for whom to wait.
 
     Raises
     ------
@@ -116,15 +116,15 @@ def follow_recording(
         Nothing was recorded in time, what is there is damaged or another recording than before, or the output cannot
         be written.
     InvalidInputError
-        No output, or no single path.
+        No output, or others are to measure.
     ScenarioError, GeometryError
         As `rfpose.process`.
     """
-    path = _single(recording)
+    path = Path(follow.path)
     if output is None:
-        raise InvalidInputError("`follow` keeps frames beside the result and needs `output`")
+        raise InvalidInputError("what follows a recording keeps frames beside the result and needs `output`")
     if is_elsewhere():
-        raise InvalidInputError("`follow` measures here, where frames arrive; leave workers out")
+        raise InvalidInputError("a recording that is followed is measured here, where frames arrive; leave workers out")
     kept = partial_of(output)
     with claim(output, inputs=[path, *asked.files, kept], force=force) as job, contextlib.ExitStack() as open_files:
         opened = open_files.enter_context(_wait_for(path, follow, follow_links=follow_links))
@@ -156,14 +156,6 @@ def follow_recording(
         write_result(complete, output)
         job.afterwards(live.remove)
         return complete
-
-
-def _single(recording: Recording | RecordingSource) -> Path:
-    if not isinstance(recording, Recording):
-        given = [recording] if isinstance(recording, str | Path) else list(recording)
-        if len(given) == 1:
-            return Path(given[0])
-    raise InvalidInputError("`follow` takes the path of one recording; put parts into one directory")
 
 
 def _wait_for(path: Path, follow: Follow, *, follow_links: bool) -> Recording:

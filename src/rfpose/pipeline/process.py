@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 
 
 def process(
-    recording: Recording | RecordingSource,
+    recording: Recording | RecordingSource | Follow,
     output: str | Path | None = None,
     *,
     scenario: Scenario | str | Path | None = None,
@@ -54,7 +54,6 @@ def process(
     integrity: bool | None = None,
     filtered: bool | None = None,
     survey: str | Path | None = None,
-    follow: Follow | None = None,
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
@@ -67,7 +66,9 @@ def process(
     Parameters
     ----------
     recording
-        Open, or whatever `rfpose.recording.open_recording` opens.
+        Open, or whatever `rfpose.recording.open_recording` opens. A `rfpose.pipeline.follow.Follow`: one that is
+        being written, each frame of which is solved when it is complete; needs ``output``, and frames so far are in
+        ``OUTPUT.partial``, which `rfpose.open_result` reads meanwhile.
     output
         File to write, format ``rfpose-result``; None: none, see `Result.save`.
     scenario
@@ -84,9 +85,6 @@ def process(
         Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
     survey
         File of `rfpose survey`: where receivers, pivots and transmitters are.
-    follow
-        The recording is being written: solve each frame when it is complete, until nothing comes any more. Frames so
-        far are in ``OUTPUT.partial``, which `open_result` reads meanwhile; needs ``output`` and one path.
     follow_links
         As for `rfpose.recording.open_recording`.
     force
@@ -129,10 +127,10 @@ def process(
         filtered=filtered,
         survey=survey,
     )
-    if follow is not None:
+    if not isinstance(recording, Recording | str | Path | Sequence):  # spares loading what follows
         from rfpose.pipeline.follow import follow_recording
 
-        return follow_recording(recording, output, asked, follow, follow_links=follow_links, force=force)
+        return follow_recording(recording, output, asked, follow_links=follow_links, force=force)
     stages = Stopwatch()
     kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
     read = recording.files() if isinstance(recording, Recording) else files_of(recording)
