@@ -12,7 +12,7 @@ __all__ = ["command"]
 @click.command(name="warm-up", epilog=examples("rfpose warm-up", "rfpose warm-up --json"))
 @common_options
 def command() -> None:
-    """Compile all kernels once, so that no later command has to; it takes some minutes, after installing.
+    """Compile all kernels once, so that no later command has to; it takes a few minutes, after installing.
 
     Each of rfpose's jobs is done on a very small field. What is compiled is kept in the package's directory or,
     where that cannot be written, in the user's cache; NUMBA_CACHE_DIR names another place.

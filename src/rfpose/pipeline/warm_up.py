@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rfpose.engine import n_core
 from rfpose.jit import compilations
 from rfpose.pipeline.demo import shipped_scenario
 from rfpose.scenario import Scenario, load_scenario
@@ -37,7 +42,10 @@ class WarmUp:
 
 
 def warm_up(*, on_progress: Callable[[int, int], None] | None = None) -> WarmUp:
-    """Do each of `JOBS` once, so that no later one has to compile.
+    """Do each of `JOBS`, so that no later one has to compile.
+
+    Processes do them side by side, one a core. Two that keep the same kernel for other types at the same time may lose
+    one of them, so all are done once more here, by then in seconds.
 
     Parameters
     ----------
@@ -49,13 +57,47 @@ def warm_up(*, on_progress: Callable[[int, int], None] | None = None) -> WarmUp:
     WarmUp
     """
     begun, before = time.monotonic(), compilations()
-    site = _small_site()
+    n_job, n_process = len(JOBS), min(n_core(), len(JOBS))
+    beside = range(n_job) if n_process > 1 else range(0)
+    n_all, compiled = len(beside) + n_job, 0
+
+    def tell(done: int) -> None:
+        if on_progress is not None:
+            on_progress(done, n_all)
+
+    tell(0)
+    running: list[subprocess.Popen[str]] = []
+    pool = ThreadPoolExecutor(n_process)
+    try:
+        for done, count in enumerate(pool.map(partial(_compiled_beside, running), beside), 1):
+            compiled += count
+            tell(done)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            process.kill()
+    for i_job in range(n_job):
+        _do(i_job)
+        tell(len(beside) + i_job + 1)
+    return WarmUp(compiled=compiled + compilations() - before, seconds=time.monotonic() - begun)
+
+
+def _compiled_beside(running: list[subprocess.Popen[str]], i_job: int) -> int:
+    """Do a job in a process of its own and return how many kernels it compiled; what fails there fails here, too."""
+    text = (
+        f"from {__name__} import _do; from {compilations.__module__} import compilations; _do({i_job}); "
+        "print(compilations())"
+    )
+    command = [sys.executable, "-c", text]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        running.append(process)
+        told = process.communicate()[0]
+    return int(told) if process.returncode == 0 else 0
+
+
+def _do(i_job: int) -> None:
     with tempfile.TemporaryDirectory(prefix="rfpose-warm-up-") as folder:
-        for done, job in enumerate(JOBS):
-            if on_progress is not None:
-                on_progress(done, len(JOBS))
-            job(site, Path(folder))
-    return WarmUp(compiled=compilations() - before, seconds=time.monotonic() - begun)
+        JOBS[i_job](_small_site(), Path(folder))
 
 
 def _small_site() -> Scenario:
@@ -122,10 +164,10 @@ def _calibration(site: Scenario, folder: Path) -> None:
 
 JOBS: tuple[Callable[[Scenario, Path], None], ...] = (
     _simulate_and_measure,
+    _tracking,
+    _layouts,
     _reflection_and_filter,
     _pose_site,
-    _layouts,
-    _tracking,
     _calibration,
 )
-"""What is done; each is given a small site and a folder for its files."""
+"""What is done, those first that have little in common; each is given a small site and a folder for its files."""
