@@ -162,7 +162,7 @@ def open_live(directory: str | Path, first_frame: int = 0) -> Result:
     key = read_key(directory)
     if key is None or _SCENARIO not in key:
         raise RecordingError(
-            f"{directory}: no result that `rfpose process --follow` makes; give such a directory, or a result"
+            f"{directory}: no result that is being made frame by frame; give such a directory, or a result"
         )
     scenario = parse_scenario(key[_SCENARIO], source=f"{directory}:scenario")
     settings = {name.removeprefix(_SETTING): text for name, text in key.items() if name.startswith(_SETTING)}
