@@ -8,6 +8,7 @@ which task, what becomes of the tasks of a worker that died, how code and result
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import functools
 import logging
 import os
@@ -44,6 +45,8 @@ _ALONE_S = 60.0
 """How long a job waits for a first worker, or another one when the last is gone."""
 _CLOSE_S = 10.0
 _SWITCH_INTERVAL_S = 1e-4
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
+_KEPT_BYTES = 32 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -338,11 +341,19 @@ def _run(item: Any, *, function: Callable[[Any, Any], Any], shared: Any, version
 
 @functools.cache
 def _settle() -> None:
-    """Keep BLAS to the thread that calls it for as long as this worker lives; see `worker_pool`."""
+    """Keep BLAS to the thread that calls it for as long as this worker lives, see `worker_pool`, and freed memory.
+
+    Dask starts workers with ``MALLOC_TRIM_THRESHOLD_``, by which each array of a frame goes back to the system and its
+    pages are asked for anew with the next frame: half as fast. The thresholds are those that glibc else finds.
+    """
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(limits=1, user_api="blas")
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # not glibc
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, _KEPT_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, 2 * _KEPT_BYTES)
 
 
 def _require_dask() -> None:

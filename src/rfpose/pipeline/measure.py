@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import pickle
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,10 +27,11 @@ from rfpose.scenario import Scenario
 __all__ = ["JOURNAL_SAMPLES", "FrameByFrame", "OtherProcesses", "extractors", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
-"""Samples measured here between two entries of the journal, and by each thread elsewhere: about a second's work."""
+"""Samples measured here between two entries of the journal, and by each thread elsewhere: less than a second's work."""
 
-_PER_THREAD = 16
-"""Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another."""
+_PER_THREAD = 4
+"""Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another, and so few that
+giving them out costs little."""
 
 _MAX_ENTRY_ROWS = 4096
 _PROBE_SAMPLES = 1024
@@ -310,7 +312,8 @@ def _share_elsewhere(bench: _Bench, elsewhere: OtherProcesses, team: Team) -> _S
         fingerprint=_fingerprint(bench.recording),
         recipe=bench.recipe,
     )
-    return _Share(bench.rows_of(JOURNAL_SAMPLES * team.n_at_once), groups, _measure_there, place)
+    packed = _Packed(key=place.key, place=pickle.dumps(place))
+    return _Share(bench.rows_of(JOURNAL_SAMPLES * team.n_at_once), groups, _measure_there, packed)
 
 
 # -- where it is done ----------------------------------------------------------------------------------------
@@ -406,19 +409,26 @@ class _Place:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Packed:
+    """A place that travels with each task, and is unpacked by a worker once: a scenario takes as long as its rows."""
+
+    key: str
+    place: bytes
+
+
 _benches: dict[str, _Bench] = {}
 """Of this worker, the newest alone: a recording stays open between its tasks."""
 _opening = threading.Lock()
 
 
-def _measure_there(place: _Place, wanted: _Wanted) -> _Measured:
+def _measure_there(packed: _Packed, wanted: _Wanted) -> _Measured:
     """Measure on a worker."""
-    key = place.key
     with _opening:
-        bench = _benches.get(key)
+        bench = _benches.get(packed.key)
         if bench is None:
             _benches.clear()
-            bench = _benches[key] = _opened(place)
+            bench = _benches[packed.key] = _opened(pickle.loads(packed.place))
     return bench.measure(wanted)
 
 
