@@ -42,8 +42,12 @@ def main() -> None:
         rf.simulate(site, seed=1).save(path)
         with (
             rf.open_recording(path) as recording,
-            distributed.LocalCluster(1, 1, dashboard_address="127.0.0.1:0", silence_logs=50) as one,
-            distributed.LocalCluster(2, 1, dashboard_address="127.0.0.1:0", silence_logs=50) as two,
+            distributed.LocalCluster(
+                n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
+            ) as one,
+            distributed.LocalCluster(
+                n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
+            ) as two,
         ):
             starts = frame_starts(recording, site.radio.frame_samples)
 
