@@ -50,16 +50,7 @@ def record(
     for k, step in enumerate(steps):
         told.recv()
         begun = time.time()
-        with RecordingWriter(
-            folder / f"frame-{k:06d}.h5",
-            scenario=recording.scenario,
-            receiver_ids=recording.receiver_ids,
-            sample_rate=recording.sample_rate,
-            centre_frequency_hz=recording.centre_frequency_hz,
-            sample_format=recording.sample_format,
-            full_scale=recording.full_scale,
-            provenance={},
-        ) as writer:
+        with RecordingWriter.like(folder / f"frame-{k:06d}.h5", recording) as writer:
             for name, iq in samples.items():
                 writer.write(name, start + step, iq)
         told.send((time.time(), time.time() - begun))

@@ -16,12 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_positive
-from rfpose.feedback.calibration import CalibratedMount, normal_differences, posture_jacobian
+from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
 
 __all__ = ["Alarm", "alarms", "axis_errors_rad"]
 
 _YEAR_S = 365.25 * 86400.0
-_SURE = 2.9677379253417944  # so many sigmas hold 99.7 % of a Gaussian variable
 _LEAST_SPAN_S = 90.0 * 86400.0
 _LEAST_DRIFT_RAD = 0.4e-3
 
@@ -49,7 +48,7 @@ class Alarm:
     size_rad: float
 
 
-def axis_errors_rad(calibration: CalibratedMount) -> FloatArray:
+def axis_errors_rad(calibration: Calibration) -> FloatArray:
     """Return what each axis would have to be wrong by to explain the errors (measurement, axis) [rad].
 
     NaN where the measurement is unknown.
@@ -63,7 +62,7 @@ def axis_errors_rad(calibration: CalibratedMount) -> FloatArray:
 
 
 def alarms(
-    calibration: CalibratedMount,
+    calibration: Calibration,
     *,
     outlier_rad: float = 5e-3,
     shift_rad: float = 2e-3,
@@ -123,7 +122,9 @@ def _cuts(series: npt.NDArray[np.float64], limit: float, least: int) -> list[int
     n = len(series)
     if n < 2 * least:
         return []
-    x = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(series, 1, mode="edge"), 3), axis=1)
+    from scipy.ndimage import median_filter  # as theilslopes below, slow to load
+
+    x = median_filter(series, size=3, mode="nearest")
     sigma = 1.4826 * float(np.median(np.abs(np.diff(series)))) / np.sqrt(2.0)
     penalty = least * max(limit, 3.0 * sigma) ** 2
     first, second = np.concatenate([[0.0], np.cumsum(x)]), np.concatenate([[0.0], np.cumsum(x**2)])
@@ -169,36 +170,16 @@ def _drift(
     """Total change along a run, if it is sure and beyond one of the limits."""
     if len(part) < 10:
         return None
-    slope, low, high = _median_slope(np.arange(float(len(part))), part)
-    total = slope * (len(part) - 1)
+    from scipy.stats import theilslopes  # takes a second to load, and only this needs it
+
+    slope, _, low, high = theilslopes(part, alpha=0.997)
+    total = float(slope) * (len(part) - 1)
     if abs(total) > limit and low * high > 0.0:
         return total
     span_s = float(unix_s[-1] - unix_s[0])
     if not span_s >= _LEAST_SPAN_S:
         return None
-    slope, low, high = _median_slope(unix_s - unix_s[0], part)
-    total = slope * span_s
-    fast = abs(slope) * _YEAR_S > limit_per_year and abs(total) > _LEAST_DRIFT_RAD
+    slope, _, low, high = theilslopes(part, unix_s - unix_s[0], alpha=0.997)
+    total = float(slope) * span_s
+    fast = abs(float(slope)) * _YEAR_S > limit_per_year and abs(total) > _LEAST_DRIFT_RAD
     return total if fast and low * high > 0.0 else None
-
-
-def _median_slope(x: npt.NDArray[np.float64], y: npt.NDArray[np.float64]) -> tuple[float, float, float]:
-    """Median slope of all pairs, and the ends of its 99.7 % interval [1]_; zeros where all ``x`` are the same.
-
-    `scipy.stats.theilslopes` gives the same, but takes a second of processor time to load.
-
-    References
-    ----------
-    .. [1] Sen, Estimates of the regression coefficient based on Kendall's tau, JASA 63 (1968) 1379.
-    """
-    i, j = np.triu_indices(len(x), 1)
-    run, rise = x[j] - x[i], y[j] - y[i]
-    slopes = np.sort(rise[run != 0.0] / run[run != 0.0])
-    if not len(slopes):
-        return 0.0, 0.0, 0.0
-    same = (np.unique(values, return_counts=True)[1] for values in (x, y))
-    pairs = [np.sum(count * (count - 1.0) * (2.0 * count + 5.0)) for count in (np.array([len(x)]), *same)]
-    width = _SURE * np.sqrt(max(pairs[0] - pairs[1] - pairs[2], 0.0) / 18.0)
-    low = max(round((len(slopes) - width) / 2.0) - 1, 0)
-    high = min(round((len(slopes) + width) / 2.0), len(slopes) - 1)
-    return float(np.median(slopes)), float(slopes[low]), float(slopes[high])

@@ -113,26 +113,16 @@ class SimulatedRecording(Recording):
             super().save(path, format=format, force=force, compress=compress, on_progress=on_progress)
             return
         path, done = Path(path), 0
-        with claim(path, inputs=self._made_from, force=force):
-            writer = RecordingWriter(
-                path,
-                scenario=self._site,
-                receiver_ids=self.receiver_ids,
-                sample_rate=self.sample_rate,
-                centre_frequency_hz=self.centre_frequency_hz,
-                sample_format=self.sample_format,
-                full_scale=self.full_scale,
-                provenance=self.provenance,
-                overwrite=True,
-                compress=compress,
-            )
-            with writer:
-                for chunk in self._simulator:
-                    writer.write(chunk.receiver_id, chunk.start_index, chunk.samples)
-                    done += len(chunk.samples)
-                    if on_progress is not None:
-                        on_progress(done, self._simulator.total_samples)
-                writer.write_truth(self._simulator.truth)
+        with (
+            claim(path, inputs=self._made_from, force=force),
+            RecordingWriter.like(path, self, overwrite=True, compress=compress) as writer,
+        ):
+            for chunk in self._simulator:
+                writer.write(chunk.receiver_id, chunk.start_index, chunk.samples)
+                done += len(chunk.samples)
+                if on_progress is not None:
+                    on_progress(done, self._simulator.total_samples)
+            writer.write_truth(self._simulator.truth)
 
     def record(
         self,
@@ -173,17 +163,7 @@ class SimulatedRecording(Recording):
             if k == 0 and pace is not None:
                 began -= due_s  # the first frame has just been recorded
             time.sleep(max(0.0, began + due_s - time.monotonic()))
-            with RecordingWriter(
-                directory / f"frame-{k:06d}.h5",
-                scenario=self._site,
-                receiver_ids=self.receiver_ids,
-                sample_rate=self.sample_rate,
-                centre_frequency_hz=self.centre_frequency_hz,
-                sample_format=self.sample_format,
-                full_scale=self.full_scale,
-                provenance=self.provenance,
-                overwrite=force,
-            ) as writer:
+            with RecordingWriter.like(directory / f"frame-{k:06d}.h5", self, overwrite=force) as writer:
                 for name in self.receiver_ids:
                     for first, count in self._segments_of(name).tolist():
                         at, end = max(first, start), min(first + count, start + n_sample)

@@ -192,17 +192,8 @@ def _to_native(
     compress: str | None,
     digests: _Digests,
 ) -> None:
-    with RecordingWriter(
-        target,
-        scenario=source.scenario,
-        receiver_ids=source.receiver_ids,
-        sample_rate=source.sample_rate,
-        centre_frequency_hz=source.centre_frequency_hz,
-        sample_format=source.sample_format,
-        full_scale=source.full_scale,
-        provenance={**source.provenance, "converted_from": f"{source.format}: {source.path.name}"},
-        compress=compress,
-    ) as writer:
+    provenance = {**source.provenance, "converted_from": f"{source.format}: {source.path.name}"}
+    with RecordingWriter.like(target, source, provenance=provenance, compress=compress) as writer:
         for receiver_id, start, samples in _pieces(source, on_progress):
             writer.write(receiver_id, start, samples)
             digests.add(receiver_id, samples)

@@ -23,6 +23,7 @@ from rfpose.recording.base import (
     FILL_VALUE,
     STORED_DTYPE,
     IqArray,
+    Recording,
     SampleFormat,
     as_stored,
 )
@@ -147,6 +148,45 @@ class RecordingWriter:
         self._iq: dict[str, h5py.Dataset] = {}
         self._blocks: dict[str, list[list[int]]] = {name: [] for name in self._receiver_ids}
         self._stored = dict.fromkeys(self._receiver_ids, 0)
+
+    @classmethod
+    def like(
+        cls,
+        path: str | Path,
+        recording: Recording,
+        *,
+        provenance: Mapping[str, str] | None = None,
+        overwrite: bool = False,
+        compress: str | None = None,
+    ) -> Self:
+        """Return a writer of what another recording holds: its site, receivers, rate, tuning and type.
+
+        Parameters
+        ----------
+        path, overwrite, compress
+            As for the class.
+        recording
+            What is to be written, or something like it.
+        provenance
+            As for the class; None: that of the recording.
+
+        Raises
+        ------
+        InvalidInputError, RecordingError
+            As the class.
+        """
+        return cls(
+            path,
+            scenario=recording.scenario,
+            receiver_ids=recording.receiver_ids,
+            sample_rate=recording.sample_rate,
+            centre_frequency_hz=recording.centre_frequency_hz,
+            sample_format=recording.sample_format,
+            full_scale=recording.full_scale,
+            provenance=recording.provenance if provenance is None else provenance,
+            overwrite=overwrite,
+            compress=compress,
+        )
 
     def __enter__(self) -> Self:
         cache = _CACHE_BYTES // len(self._receiver_ids)
