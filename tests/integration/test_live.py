@@ -18,7 +18,8 @@ from rfpose.dsp import LineStatus
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.pipeline import follow
 from rfpose.pipeline.follow import Follow
-from rfpose.pipeline.formats.live_result import ResultFollower, open_live, partial_of
+from rfpose.pipeline.formats.journal import partial_of
+from rfpose.pipeline.formats.live_result import ResultFollower, open_live
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.publish import messages, messages_as_they_come
 from rfpose.recording.segments import open_growing

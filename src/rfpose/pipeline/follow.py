@@ -22,7 +22,8 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
 from rfpose.interruption import check
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.formats.live_result import LiveResult, partial_of, probe_in
+from rfpose.pipeline.formats.journal import partial_of
+from rfpose.pipeline.formats.live_result import LiveResult, probe_in
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import write_result
 from rfpose.pipeline.formats.survey_file import SurveyFile
@@ -177,11 +178,7 @@ def _wait_for(path: Path, follow: Follow, *, follow_links: bool) -> Recording:
 def _probe(recording: Recording, site: Scenario, grid: _Grid, told: str | None) -> str:
     """Return what tells the recording from others: its first frame, as far as it is still there.
 
-    Parameters
-    ----------
-    recording, site, grid
-    told
-        What was told of it before an interruption.
+    ``told`` is what was told of it before an interruption.
     """
     n_sample = site.radio.frame_samples
     with contextlib.suppress(ValueError, TypeError, KeyError):

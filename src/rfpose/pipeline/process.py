@@ -17,7 +17,7 @@ from rfpose import __version__
 from rfpose.engine import is_elsewhere
 from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
 from rfpose.files import claim
-from rfpose.pipeline.formats.journal import Journal
+from rfpose.pipeline.formats.journal import Journal, partial_of
 from rfpose.pipeline.stages import Stopwatch
 from rfpose.recording import (
     Recording,
@@ -132,7 +132,7 @@ def process(
 
         return follow_recording(recording, output, asked, follow_links=follow_links, force=force)
     stages = Stopwatch()
-    kept = None if output is None else Path(output).with_name(f"{Path(output).name}.partial")
+    kept = None if output is None else partial_of(output)
     read = recording.files() if isinstance(recording, Recording) else files_of(recording)
     with claim(output, inputs=[*read, *asked.files, kept], force=force) as job:
         with contextlib.ExitStack() as open_files:

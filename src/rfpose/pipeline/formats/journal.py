@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rfpose.errors import RecordingError
 from rfpose.files import make_directory, replace_content
 
-__all__ = ["Entry", "Journal", "entries_in", "read_entry", "read_key"]
+__all__ = ["Entry", "Journal", "entries_in", "partial_of", "read_entry", "read_key"]
 
 Entry = dict[str, npt.NDArray[Any]]
 
@@ -26,6 +26,12 @@ _KEY_NAME = "key.json"
 _ENTRY_NAME = re.compile(r"rows-(\d{12})-(\d{12})\.npz")
 
 _log = logging.getLogger(__name__)
+
+
+def partial_of(path: str | Path) -> Path:
+    """Return where a result is kept while it is made."""
+    path = Path(path)
+    return path.with_name(f"{path.name}.partial")
 
 
 def read_key(directory: Path) -> dict[str, str] | None:

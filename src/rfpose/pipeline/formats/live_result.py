@@ -17,12 +17,12 @@ import numpy.typing as npt
 from rfpose.dsp import FrameTones, TonePhases
 from rfpose.errors import RecordingError, RfposeError
 from rfpose.interruption import held_back
-from rfpose.pipeline.formats.journal import Entry, Journal, entries_in, read_entry, read_key
+from rfpose.pipeline.formats.journal import Entry, Journal, entries_in, partial_of, read_entry, read_key
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import KEYS, columns_of, open_result, result_of
 from rfpose.scenario import Scenario, parse_scenario
 
-__all__ = ["LiveResult", "ResultFollower", "is_live", "n_frame_in", "open_live", "partial_of", "probe_in"]
+__all__ = ["LiveResult", "ResultFollower", "is_live", "n_frame_in", "open_live", "probe_in"]
 
 _SCENARIO = "scenario"
 _PROBE = "first frame"
@@ -33,12 +33,6 @@ _MERGED = 64
 """Files of one frame that become one."""
 _MERGED_BYTES = 2**23
 """Or fewer, where they are as large together."""
-
-
-def partial_of(path: str | Path) -> Path:
-    """Return where a result is kept while it is made."""
-    path = Path(path)
-    return path.with_name(f"{path.name}.partial")
 
 
 def is_live(path: str | Path) -> bool:
