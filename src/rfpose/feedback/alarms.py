@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_positive
-from rfpose.feedback.calibration import Calibration, normal_differences, posture_jacobian
+from rfpose.feedback.calibration import CalibratedMount, normal_differences, posture_jacobian
 
 __all__ = ["Alarm", "alarms", "axis_errors_rad"]
 
@@ -48,7 +48,7 @@ class Alarm:
     size_rad: float
 
 
-def axis_errors_rad(calibration: Calibration) -> FloatArray:
+def axis_errors_rad(calibration: CalibratedMount) -> FloatArray:
     """Return what each axis would have to be wrong by to explain the errors (measurement, axis) [rad].
 
     NaN where the measurement is unknown.
@@ -62,7 +62,7 @@ def axis_errors_rad(calibration: Calibration) -> FloatArray:
 
 
 def alarms(
-    calibration: Calibration,
+    calibration: CalibratedMount,
     *,
     outlier_rad: float = 5e-3,
     shift_rad: float = 2e-3,

@@ -5,11 +5,10 @@ import itertools
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.stats import theilslopes
 
 from rfpose import geometry
 from rfpose.errors import InvalidInputError
-from rfpose.feedback.alarms import _median_slope, alarms
+from rfpose.feedback.alarms import alarms
 from rfpose.feedback.calibration import (
     PARAMETER_SETS,
     FitSettings,
@@ -314,12 +313,3 @@ def test_a_field_goes_on_past_a_heliostat_that_cannot_be_fitted():
 def test_mistakes_are_named(free, settings, message):
     with pytest.raises(InvalidInputError, match=message):
         fit(START, spots(np.random.default_rng(24), 5), free=free, settings=FitSettings(**settings))
-
-
-@pytest.mark.parametrize("decimals", [12, 1])  # the latter with ties
-def test_median_slope_is_that_of_scipy(decimals):
-    rng = np.random.default_rng(8)
-    x = np.round(rng.uniform(0.0, 9.0, 40), decimals)
-    y = np.round(0.1 * x + rng.normal(size=40), decimals)
-    slope, _, low, high = theilslopes(y, x, alpha=0.997)
-    np.testing.assert_allclose(_median_slope(x, y), (slope, low, high), rtol=1e-12)
