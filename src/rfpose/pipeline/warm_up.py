@@ -45,7 +45,7 @@ def warm_up(*, on_progress: Callable[[int, int], None] | None = None) -> WarmUp:
     """Do each of `JOBS`, so that no later one has to compile.
 
     Processes do them side by side, one a core. Two that keep the same kernel for other types at the same time may lose
-    one of them, so all are done once more here, by then in seconds.
+    one of them, so all are done once more here if anything was compiled, by then in seconds.
 
     Parameters
     ----------
@@ -59,31 +59,33 @@ def warm_up(*, on_progress: Callable[[int, int], None] | None = None) -> WarmUp:
     begun, before = time.monotonic(), compilations()
     n_job, n_process = len(JOBS), min(n_core(), len(JOBS))
     beside = range(n_job) if n_process > 1 else range(0)
-    n_all, compiled = len(beside) + n_job, 0
+    compiled, is_warm = 0, n_process > 1
 
     def tell(done: int) -> None:
         if on_progress is not None:
-            on_progress(done, n_all)
+            on_progress(done, len(beside) + n_job)
 
     tell(0)
     running: list[subprocess.Popen[str]] = []
     pool = ThreadPoolExecutor(n_process)
     try:
         for done, count in enumerate(pool.map(partial(_compiled_beside, running), beside), 1):
-            compiled += count
+            compiled += count or 0
+            is_warm = is_warm and count == 0
             tell(done)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in running:
             process.kill()
     for i_job in range(n_job):
-        _do(i_job)
+        if not is_warm:
+            _do(i_job)
         tell(len(beside) + i_job + 1)
     return WarmUp(compiled=compiled + compilations() - before, seconds=time.monotonic() - begun)
 
 
-def _compiled_beside(running: list[subprocess.Popen[str]], i_job: int) -> int:
-    """Do a job in a process of its own and return how many kernels it compiled; what fails there fails here, too."""
+def _compiled_beside(running: list[subprocess.Popen[str]], i_job: int) -> int | None:
+    """Do a job in a process of its own and return how many kernels it compiled; None: it failed, as it will here."""
     text = (
         f"from {__name__} import _do; from {compilations.__module__} import compilations; _do({i_job}); "
         "print(compilations())"
@@ -92,7 +94,7 @@ def _compiled_beside(running: list[subprocess.Popen[str]], i_job: int) -> int:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         running.append(process)
         told = process.communicate()[0]
-    return int(told) if process.returncode == 0 else 0
+    return int(told) if process.returncode == 0 else None
 
 
 def _do(i_job: int) -> None:
