@@ -177,9 +177,8 @@ def extractors(recording: Recording, scenario: Scenario, estimator: str = "hilbe
         return ToneExtractor(plan, estimator, full_scale=recording.full_scale)
 
     as_told = made(None)
-    others = {tuned: made(tuned) for name in recording.tunings if (tuned := recording.tuning_of(name)) is not None}
-    if recording.tunings and (first := recording.centre_frequency_hz) is not None:
-        others[first] = made(first)
+    apart = {recording.centre_frequency_hz, *recording.tunings.values()} if recording.tunings else set()
+    others = {tuned: made(tuned) for tuned in apart if tuned is not None}
 
     def of(receiver_id: str) -> ToneExtractor:
         tuned = recording.tuning_of(receiver_id)
