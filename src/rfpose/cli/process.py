@@ -263,7 +263,9 @@ class _Heard:
         if time.monotonic() - self._said_at < _SAID_EVERY_S:
             return
         self._said_at = time.monotonic()
-        solved, wanted = int((result.poses.status == 0).sum()), result.poses.status.size
+        from rfpose.multilat import PoseStatus
+
+        solved, wanted = int((result.poses.status == PoseStatus.OK).sum()), result.poses.status.size
         at = _frame_text(result)
         click.echo(f"rfpose: {self._n_frame} frames; that of {at}: {solved} of {wanted} poses solved", err=True)
 
