@@ -164,6 +164,34 @@ def test_unfinished_work_of_another_recording_is_not_mixed_in(
     assert result.read_bytes() == clean.read_bytes()
 
 
+def test_work_that_never_began_is_in_nobodys_way(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = tmp_path / "result.h5"
+    _stop_after(recording, result, 0, monkeypatch)
+    assert [path.name for path in (tmp_path / "result.h5.partial").iterdir()] == ["key.json"]
+    process(recording, result, estimator="correlator")
+    assert result.exists()
+    assert not (tmp_path / "result.h5.partial").exists()
+
+
+def test_interrupted_while_it_waits_for_a_recording(tmp_path: Path) -> None:
+    command = [
+        Path(sys.executable).with_name("rfpose"),
+        "process",
+        tmp_path / "night",
+        "-o",
+        tmp_path / "result.h5",
+        "--follow",
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as waiting:
+        assert waiting.stderr is not None
+        assert "not there yet; waiting for it" in waiting.stderr.readline()
+        waiting.send_signal(signal.SIGINT)
+        assert waiting.stderr.read().strip() == "rfpose: interrupted; no frame was complete yet"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_damaged_journal_entry_is_measured_again(
     recording: Path,
     undisturbed: bytes,

@@ -237,29 +237,34 @@ def _follow(
         raise click.UsageError("--follow reads Digital RF and rfpose-iq; leave --format out")
     if len(recording) > 1:
         raise click.UsageError("--follow takes one RECORDING; let the recorders write into one directory")
-    session.when_interrupted = (
-        f"interrupted; frames so far are in {output}.partial, and the same command goes on where it stopped"
-    )
     from rfpose.pipeline.follow import Follow
+    from rfpose.pipeline.formats.journal import partial_of
     from rfpose.recording.declared import seconds_of
 
+    kept = partial_of(output)
+    goes_on = f"interrupted; frames so far are in {kept}, and the same command goes on where it stopped"
+    session.when_interrupted = goes_on if kept.exists() else "interrupted; no frame was complete yet"
+    if not recording[0].exists():
+        click.echo(f"rfpose: note: {recording[0]}: not there yet; waiting for it", err=True)
     return Follow(
         recording[0],
         idle_timeout_s=following.idle_timeout_s,
         until_s=None if following.until is None else seconds_of(following.until, "`until`"),
         lateness_s=following.lateness_s,
-        on_frame=_Heard(),
+        on_frame=_Heard(session, goes_on),
     )
 
 
 class _Heard:
     """Says now and then how far a recording is followed."""
 
-    def __init__(self) -> None:
+    def __init__(self, session: CommonOptions, goes_on: str) -> None:
+        self._session, self._goes_on = session, goes_on
         self._n_frame, self._said_at = 0, -math.inf
 
     def __call__(self, result: Result) -> None:
         self._n_frame += 1
+        self._session.when_interrupted = self._goes_on
         if time.monotonic() - self._said_at < _SAID_EVERY_S:
             return
         self._said_at = time.monotonic()

@@ -88,7 +88,7 @@ class Journal:
         if found is None:
             self._refuse_strangers()
         elif found != dict(key):
-            if not restart:
+            if not restart and entries_in(directory):  # without any nothing is lost
                 differing = ", ".join(sorted(k for k in {*found, *key} if found.get(k) != key.get(k)))
                 raise RecordingError(
                     f"{directory}: holds the unfinished work of another job (different: {differing}); repeat that "
