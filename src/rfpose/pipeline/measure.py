@@ -233,7 +233,7 @@ class FrameByFrame:
             tone_hz=scenario.tone_hz,
             frame_start_index=starts,
         )
-        rows = [np.array([i]) for i in range(n_receiver)]
+        rows = np.array_split(np.arange(n_receiver), min(n_receiver, _PER_THREAD * self._team.n_at_once))
         wanted = [_Wanted(0, n_receiver, row, self._clock_ppm[row]) for row in rows]
         for i, measured in self._team.map(_measure_here, wanted, self._bench):
             self._clock_ppm[rows[i]] = measured.clock_ppm
@@ -327,7 +327,8 @@ class _Bench:
         self._receiver_ids = recipe.scenario.receiver_ids
         self._n_sample = recipe.scenario.radio.frame_samples
         self._extractor_of = extractors(recording, recipe.scenario, recipe.estimator)
-        self._lock = threading.Lock()  # not every format's library can be called from several threads at once
+        # not every format's library can be called from several threads at once
+        self._lock = contextlib.nullcontext() if recording.serves_threads else threading.Lock()
         self._own = threading.local()
 
     @property

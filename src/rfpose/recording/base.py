@@ -133,6 +133,8 @@ class Recording(ABC):
 
     grows: ClassVar[bool] = False
     """Whether `refresh` may find more than there was when it was opened."""
+    serves_threads: ClassVar[bool] = False
+    """Whether several threads may read different receivers at once."""
 
     def __init__(
         self,
@@ -331,6 +333,8 @@ class Recording(ABC):
             ``start_index`` where the receiver recorded all of the frame; else the first sample of the nearest
             frame within one of its blocks, at most a quarter of a frame away.
         """
+        if self.covers(receiver_id, start_index, frame_samples):
+            return start_index
         begin = int(own_frames(self.blocks(receiver_id), np.array([start_index]), frame_samples)[0])
         return None if begin < 0 else begin
 

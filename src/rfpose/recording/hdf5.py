@@ -14,7 +14,7 @@ import h5py
 from rfpose.errors import RecordingError
 from rfpose.recording.links import FOLLOW
 
-__all__ = ["FROM_SAMPLES", "FROM_TABLE", "find_dataset", "find_item", "printable"]
+__all__ = ["FROM_SAMPLES", "FROM_TABLE", "PlainFile", "find_dataset", "find_item", "printable"]
 
 FROM_SAMPLES: Final = 1100
 """As many bytes as one stored byte may stand for in samples, which are read piece by piece: what deflate reaches."""
@@ -94,7 +94,7 @@ def _plain_item(group: h5py.h5g.GroupID, parts: list[str]) -> h5py.Group | h5py.
             raise _NotPlainError
         found = h5py.h5o.open(found, encoded)
     if isinstance(found, h5py.h5d.DatasetID):
-        return h5py.Dataset(found)
+        return h5py.Dataset(found, readonly=True)  # so that it asks for its shape once
     return h5py.Group(found) if isinstance(found, h5py.h5g.GroupID) else None
 
 
@@ -124,29 +124,34 @@ def find_dataset(
     item = find_item(file, place, follow_links=follow_links, within=within)
     if not isinstance(item, h5py.Dataset):
         return None
-    where = f"{file.filename}: `{place}`"
-    settings = item.id.get_create_plist()
-    elsewhere = bool(settings.get_external_count()) or item.is_virtual
+    settings, shape = item.id.get_create_plist(), item.shape
+    layout, n_filter, item_bytes = settings.get_layout(), settings.get_nfilters(), item.id.get_type().get_size()
+    elsewhere = layout == h5py.h5d.VIRTUAL or bool(settings.get_external_count())
     if elsewhere and not follow_links:
-        raise RecordingError(f"{where} has its values in another file, which is not read; {FOLLOW}")
+        raise RecordingError(f"{file.filename}: `{place}` has its values in another file, which is not read; {FOLLOW}")
+    if n_filter:
+        _check_filters(f"{file.filename}: `{place}`", settings, item_bytes)
+    declared = 0 if shape is None else math.prod(shape) * item_bytes
+    if not elsewhere and declared > _UNSTORED_BYTES:
+        # of what was never written HDF5 counts as stored what it would take
+        stored = min(item.id.get_storage_size(), os.stat(file.filename).st_size)
+        if declared > _UNSTORED_BYTES + per_stored * stored:
+            raise RecordingError(
+                f"{file.filename}: `{place}` declares {declared / 1e9:.3g} GB, of which {stored / 1e9:.3g} GB are "
+                "stored; the file is damaged or was not completed: make it again"
+            )
+    return item
+
+
+def _check_filters(where: str, settings: h5py.h5p.PropDCID, item_bytes: int) -> None:
     for i in range(settings.get_nfilters()):
         _check_filter(where, *settings.get_filter(i)[::3])
-    item_bytes = item.id.get_type().get_size()
-    chunk = math.prod(item.chunks or (0,)) * item_bytes
-    if settings.get_nfilters() and chunk > _FILTERED_CHUNK_BYTES:
+    chunk = math.prod(settings.get_chunk()) * item_bytes
+    if chunk > _FILTERED_CHUNK_BYTES:
         raise RecordingError(
             f"{where} is compressed in chunks of {chunk / 1e9:.3g} GB, each of which must be inflated as a whole; "
             "write it again in chunks of about 1 MB"
         )
-    declared = 0 if item.shape is None else math.prod(item.shape) * item_bytes
-    # of what was never written HDF5 counts as stored what it would take
-    stored = min(item.id.get_storage_size(), os.stat(file.filename).st_size)
-    if not elsewhere and declared > _UNSTORED_BYTES + per_stored * stored:
-        raise RecordingError(
-            f"{where} declares {declared / 1e9:.3g} GB, of which {stored / 1e9:.3g} GB are stored; the file is damaged "
-            "or was not completed: make it again"
-        )
-    return item
 
 
 def _check_filter(where: str, code: int, name: bytes) -> None:
@@ -160,3 +165,82 @@ def _check_filter(where: str, code: int, name: bytes) -> None:
             f"{where} is compressed by the HDF5 filter {code} ({called:.40}), which is not installed; install it with "
             "`pip install hdf5plugin`, or write the file again without it (`h5repack -f NONE`)"
         )
+
+
+class PlainFile:
+    """Reads uncompressed datasets of an open file beside the HDF5 library, which serves one thread at a time.
+
+    Parameters
+    ----------
+    file
+        Open, of this machine's own file system.
+    """
+
+    def __init__(self, file: h5py.File) -> None:
+        access, create = file.id.get_access_plist(), file.id.get_create_plist()
+        is_plain = access.get_driver() == h5py.h5fd.SEC2 and create.get_userblock() == 0
+        self._descriptor: int | None = file.id.get_vfd_handle() if is_plain else None
+        self._chunks: dict[int, tuple[int, int] | None] = {}
+
+    def read(self, dataset: h5py.Dataset, first: int, target: memoryview) -> bool:
+        """Fill a buffer with a dataset's items, as they are stored.
+
+        Parameters
+        ----------
+        dataset
+            Of this file and with one axis.
+        first
+            The first item.
+        target
+            Bytes of so many items.
+
+        Returns
+        -------
+        bool
+            False: they are not stored as they are, or not all; the HDF5 library knows what is to be said of it.
+
+        Raises
+        ------
+        OSError, RuntimeError
+            They cannot be read.
+        """
+        if dataset.id.id not in self._chunks:
+            self._chunks[dataset.id.id] = _plain_chunk(dataset)
+        plain = self._chunks[dataset.id.id]
+        if self._descriptor is None or plain is None:
+            return False
+        item, length = plain
+        at, done = first * item, 0
+        if length == 0:
+            offset = dataset.id.get_offset()
+            return offset is not None and _pread(self._descriptor, target, offset + at)
+        while done < len(target):
+            i_chunk, skip = divmod(at + done, length * item)
+            offset = dataset.id.get_chunk_info_by_coord((i_chunk * length,)).byte_offset
+            take = min(length * item - skip, len(target) - done)
+            if offset is None or not _pread(self._descriptor, target[done : done + take], offset + skip):
+                return False
+            done += take
+        return True
+
+
+def _plain_chunk(dataset: h5py.Dataset) -> tuple[int, int] | None:
+    """Return the bytes of an item and the items of a chunk, 0: there are no chunks; None: not stored as it is."""
+    settings = dataset.id.get_create_plist()
+    item: int = dataset.id.get_type().get_size()
+    if settings.get_layout() == h5py.h5d.CHUNKED and not settings.get_nfilters():
+        return item, int(settings.get_chunk()[0])
+    if settings.get_layout() == h5py.h5d.CONTIGUOUS:  # in another file: no offset
+        return item, 0
+    return None
+
+
+def _pread(descriptor: int, target: memoryview, offset: int) -> bool:
+    """Fill a buffer from a place of a file; False: the file ends before."""
+    done = 0
+    while done < len(target):
+        n_byte = os.preadv(descriptor, [target[done:]], offset + done)
+        if n_byte == 0:
+            return False
+        done += n_byte
+    return True

@@ -18,7 +18,7 @@ from rfpose.foreign import exact_rate
 from rfpose.kinds import told_kind
 from rfpose.recording import keys
 from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
-from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
+from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, PlainFile, find_dataset, find_item, printable
 from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
@@ -28,6 +28,7 @@ _REMEDY = "the file is damaged or was not written by rfpose: make it again with 
 _HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError)
 """What h5py raises at what it cannot read or has no type for."""
 _RECEIVER_ID: Final = re.compile(r"[A-Za-z0-9_.\-]+")
+_INDEX_DTYPE: Final = np.dtype("<i8")
 _LARGEST_FREQUENCY_HZ: Final = 1e15
 _TRUTH_IDS: Final = ("heliostat_ids", "receiver_ids", "transmitter_ids")
 _TRUTH_AXES: Final[dict[str, tuple[str | int, ...]]] = {
@@ -43,6 +44,8 @@ _TRUTH_AXES: Final[dict[str, tuple[str | int, ...]]] = {
 
 class NativeRecording(Recording):
     """An rfpose-iq file. Open it through `open_recording`."""
+
+    serves_threads = True
 
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         self._file = _open_hdf5(path)
@@ -70,6 +73,7 @@ class NativeRecording(Recording):
             for receiver_id in self.receiver_ids:
                 self._iq[receiver_id] = fields.iq(receiver_id, STORED_DTYPE[sample_format])
             self._fields = fields
+            self._plain = None if follow_links else PlainFile(self._file)
             self._offsets: dict[str, IndexArray] = {}
         except BaseException as error:
             self._file.close()
@@ -94,10 +98,12 @@ class NativeRecording(Recording):
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         first = int(self._offsets[receiver_id][i_segment]) + skip
-        target = as_stored(out, self.sample_format)
+        dataset = self._iq[receiver_id]
         try:
+            if self._plain is not None and self._plain.read(dataset, first, out.data.cast("B")):
+                return
             # the buffer has the file's own compound type, so HDF5 copies bytes and converts nothing
-            self._iq[receiver_id].read_direct(target, np.s_[first : first + len(target)])
+            dataset.read_direct(as_stored(out, self.sample_format), np.s_[first : first + len(out)])
         except _HDF5_ERRORS as error:
             raise RecordingError(
                 f"{self.path}: cannot read `/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}` at {first}: {error}; copy the "
@@ -108,6 +114,11 @@ class NativeRecording(Recording):
 @functools.cache
 def _type_of(dtype: np.dtype[Any]) -> h5py.h5t.TypeID:
     return h5py.h5t.py_create(dtype, logical=True)
+
+
+def _is_of(dataset: h5py.Dataset, dtype: np.dtype[Any]) -> bool:
+    """Tell whether a dataset has a type; as numpy compares, which is asked only where HDF5's types differ."""
+    return bool(dataset.id.get_type().equal(_type_of(dtype))) or dataset.dtype == dtype
 
 
 def _open_hdf5(path: Path) -> h5py.File:
@@ -277,8 +288,7 @@ class _Fields:
         dataset = self._dataset(
             place, "a dataset of samples", per_stored=FROM_SAMPLES, within=self._receiver(receiver_id)
         )
-        is_same = dataset.id.get_type().equal(_type_of(dtype))  # as numpy's comparison, without making a dtype
-        if dataset.ndim != 1 or not (is_same or dataset.dtype == dtype):
+        if dataset.id.rank != 1 or not _is_of(dataset, dtype):
             raise RecordingError(
                 f"{self._path}: `{place}` must be one-dimensional of type {dtype}, is {dataset.ndim}-dimensional of "
                 f"type {dataset.dtype}; {_REMEDY}"
@@ -289,12 +299,15 @@ class _Fields:
         """Return (block, 3) rows [start index, count, offset in iq], checked."""
         place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
         dataset = self._dataset(place, "a table of int64", within=self._receiver(receiver_id))
-        if dataset.ndim != 2 or dataset.shape[1] != 3 or dataset.dtype != np.dtype("<i8"):
+        shape = dataset.shape
+        if len(shape) != 2 or shape[1] != 3 or not _is_of(dataset, _INDEX_DTYPE):
             raise RecordingError(
                 f"{self._path}: `{place}` must be int64 of shape (block, 3), is {dataset.dtype} of shape "
-                f"{dataset.shape}; {_REMEDY}"
+                f"{shape}; {_REMEDY}"
             )
-        rows: IndexArray = dataset[()]
+        rows: IndexArray = np.empty(shape, _INDEX_DTYPE)
+        if rows.size:
+            dataset.id.read(h5py.h5s.ALL, h5py.h5s.ALL, rows)  # as `dataset[()]`, which takes several times as long
         start, count, offset = rows[:, 0], rows[:, 1], rows[:, 2]
         # subtractions, not sums: numbers from a damaged file must not overflow into plausible ones
         in_range = (start >= 0) & (start <= MAX_SAMPLE_INDEX) & (count > 0) & (offset >= 0) & (offset <= n_stored)

@@ -51,7 +51,7 @@ class Hdf5Output:
             with held_back():
                 self._claim.take()
                 self._sink = _Sink(self._claim.part(path))
-                self.file = h5py.File(self._sink, "w", rdcc_nbytes=rdcc_nbytes)
+                self.file = h5py.File(self._sink, "w", libver=("v110", "v110"), rdcc_nbytes=rdcc_nbytes)
             self._check()
         except BaseException as error:
             self.discard()

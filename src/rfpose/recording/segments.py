@@ -80,6 +80,7 @@ class SegmentsRecording(Recording):
     """
 
     grows = True
+    serves_threads = True
 
     def __init__(self, path: Path, first: NativeRecording, *, scenario: Scenario | None, follow_links: bool) -> None:
         super().__init__(
