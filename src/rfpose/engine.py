@@ -162,8 +162,19 @@ def team_of() -> Iterator[Team]:
 
 
 @contextlib.contextmanager
-def team_here() -> Iterator[Team]:
-    """Yield a team of this process's threads, one a core: for tasks that do not share the cores by themselves."""
+def team_here(*, alone: bool = False) -> Iterator[Team]:
+    """Yield a team of this process's threads, one a core: for tasks that do not share the cores by themselves.
+
+    Parameters
+    ----------
+    alone
+        The thread that asks does all: for tasks of many pieces so short that threads would mostly wait for the
+        interpreter, which takes longer to hand over than a piece to do.
+    """
+    if alone:
+        with _one_thread_of_blas():
+            yield _Here(None, 1)
+        return
     with worker_pool() as pool:
         yield _Here(pool, n_core())
 
@@ -185,19 +196,24 @@ def worker_pool() -> Iterator[Executor]:
     A frame's matrix products are too small to share; BLAS threads that wait for each other would only take the
     cores from the other receivers.
     """
-    from threadpoolctl import threadpool_limits
-
     # a thread that comes out of a kernel should not wait Python's usual 5 ms for the interpreter
     switch_interval = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
-        with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(n_core(), "rfpose") as pool:
+        with _one_thread_of_blas(), ThreadPoolExecutor(n_core(), "rfpose") as pool:
             try:
                 yield pool
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
     finally:
         sys.setswitchinterval(switch_interval)
+
+
+def _one_thread_of_blas() -> contextlib.AbstractContextManager[object]:
+    from threadpoolctl import threadpool_limits
+
+    limits: contextlib.AbstractContextManager[object] = threadpool_limits(limits=1, user_api="blas")
+    return limits
 
 
 class _Here:

@@ -148,9 +148,9 @@ def follow_recording(
         for start in grid.frames(between=live.tidy):
             result = poses.of_frame(measure.measure(start))
             live.append(result)
-            opened.forget(start)
             if follow.on_frame is not None:
                 follow.on_frame(result)
+            opened.forget(start)
         tones = live.tones()
         truth = _truth(path, opened, tones, site, follow_links=follow_links)
         complete = poses.of_all(tones, truth)

@@ -33,6 +33,8 @@ _PER_THREAD = 4
 """Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another, and so few that
 giving them out costs little."""
 
+_FOR_THREADS_SAMPLES = 200_000
+"""Of a frame; in shorter ones a kernel takes less time than it takes a thread to get the interpreter back."""
 _MAX_ENTRY_ROWS = 4096
 _PROBE_SAMPLES = 1024
 _CLOCK_STATE = "clock_state_ppm"
@@ -149,7 +151,7 @@ def measure_tones(
         return tones
     recipe = _Recipe(scenario=scenario, frame_start_index=frame_start_index, estimator=estimator)
     bench = _Bench(recording, recipe)
-    with _team(elsewhere) as team:
+    with _team_here(scenario) if elsewhere is None else team_of() as team:
         share = _share_here(bench, n_receiver) if elsewhere is None else _share_elsewhere(bench, elsewhere, team)
         stages.cores = team.n_at_once
         while done < n_row:
@@ -210,7 +212,7 @@ class FrameByFrame:
         self._open = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        self._team = self._open.enter_context(team_here())
+        self._team = self._open.enter_context(_team_here(self._recipe.scenario))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -293,8 +295,8 @@ class _Recipe:
     estimator: str
 
 
-def _team(elsewhere: OtherProcesses | None) -> contextlib.AbstractContextManager[Team]:
-    return team_here() if elsewhere is None else team_of()
+def _team_here(scenario: Scenario) -> contextlib.AbstractContextManager[Team]:
+    return team_here(alone=scenario.radio.frame_samples < _FOR_THREADS_SAMPLES)
 
 
 def _share_here(bench: _Bench, n_receiver: int) -> _Share:

@@ -520,8 +520,8 @@ def _best_offsets(recording: Recording, runs: IndexArray, frame_samples: int) ->
 
 def merge_rows(rows: IndexArray) -> IndexArray:
     """Join rows [start, count], sorted by start, that touch or overlap."""
-    if len(rows) == 0:
-        return np.empty((0, 2), np.int64)
+    if len(rows) < 2:
+        return rows.reshape(-1, 2).astype(np.int64)
     start = rows[:, 0]
     reached = np.maximum.accumulate(start + rows[:, 1])
     opens = np.concatenate([[True], start[1:] > reached[:-1]])

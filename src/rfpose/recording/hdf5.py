@@ -124,14 +124,17 @@ def find_dataset(
     item = find_item(file, place, follow_links=follow_links, within=within)
     if not isinstance(item, h5py.Dataset):
         return None
-    settings, shape = item.id.get_create_plist(), item.shape
-    layout, n_filter, item_bytes = settings.get_layout(), settings.get_nfilters(), item.id.get_type().get_size()
+    shape, item_bytes = item.shape, item.id.get_type().get_size()
+    declared = 0 if shape is None else math.prod(shape) * item_bytes
+    if declared <= _UNSTORED_BYTES and item.id.get_offset() is not None:
+        return item  # it lies in this file in one piece, without filters
+    settings = item.id.get_create_plist()
+    layout, n_filter = settings.get_layout(), settings.get_nfilters()
     elsewhere = layout == h5py.h5d.VIRTUAL or bool(settings.get_external_count())
     if elsewhere and not follow_links:
         raise RecordingError(f"{file.filename}: `{place}` has its values in another file, which is not read; {FOLLOW}")
     if n_filter:
         _check_filters(f"{file.filename}: `{place}`", settings, item_bytes)
-    declared = 0 if shape is None else math.prod(shape) * item_bytes
     if not elsewhere and declared > _UNSTORED_BYTES:
         # of what was never written HDF5 counts as stored what it would take
         stored = min(item.id.get_storage_size(), os.stat(file.filename).st_size)

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -69,6 +69,7 @@ class _Segment:
     """One closed file."""
 
     recording: NativeRecording
+    receiver_ids: frozenset[str]
     end: int
     """Of its last receiver."""
 
@@ -152,13 +153,10 @@ class SegmentsRecording(Recording):
             _log.warning("%s: %s; it is left out", found.path, wrong)
             found.close()
             return
-        for name, rows in blocks.items():
-            if len(rows):
-                self._reached[name] = int(rows[-1].sum())
+        reached = {name: int(rows[-1].sum()) for name, rows in blocks.items() if len(rows)}
+        self._reached.update(reached)
         self.receiver_ids = tuple(dict.fromkeys((*self.receiver_ids, *found.receiver_ids)))
-        self._kept.append(
-            _Segment(found, max((int(rows[-1].sum()) for rows in blocks.values() if len(rows)), default=0))
-        )
+        self._kept.append(_Segment(found, frozenset(found.receiver_ids), max(reached.values(), default=0)))
         self._lay_out()
 
     def _unlike(self, found: NativeRecording) -> str | None:
@@ -174,15 +172,15 @@ class SegmentsRecording(Recording):
         self._rows.clear()
 
     def _load_segments(self, receiver_id: str) -> IndexArray:
-        rows: list[Any] = []
+        rows = [np.empty((0, 2), np.int64)]
         where: list[tuple[_Segment, int]] = []
         for segment in self._kept:
-            if receiver_id in segment.recording.receiver_ids:
-                for row in segment.recording.blocks(receiver_id):
-                    rows.append(row)
-                    where.append((segment, int(row[0])))
+            if receiver_id in segment.receiver_ids:
+                blocks = segment.recording.blocks(receiver_id)
+                rows.append(blocks)
+                where.extend((segment, start) for start in blocks[:, 0].tolist())
         self._rows[receiver_id] = where
-        return np.array(rows, np.int64).reshape(-1, 2)
+        return np.concatenate(rows)
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         segment, start = self._rows[receiver_id][i_segment]
