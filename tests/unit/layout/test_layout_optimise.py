@@ -247,3 +247,18 @@ def test_no_tower_is_placed_inside_a_building():
     found = rf.optimise(built, starts=2, rules=Rules(radius_m=100.0, height_m=(20.0, 50.0))).scenario
     assert not any(box.holds(t.position_enu_m) for box in found.site.structures.box for t in found.transmitter)
     assert all(box.holds(tuple(place)) for box, place in zip(found.site.structures.box, wanted[:3], strict=True))
+
+
+def test_lines_of_sight_are_searched_for_only_where_the_best_places_stand_in_them():
+    site, searched = rf.load_scenario(rf.shipped_scenario("table2_100m.toml")), []
+    for sight_m in (None, 8.0, 0.0):
+        told: list[tuple[int, int]] = []
+        found = rf.optimise(site, starts=2, rules=Rules(sight_m=sight_m), on_progress=lambda *k: told.append(k))  # noqa: B023
+        searched.append((sight_m, found.without_sight is not None, max(told)))
+        if sight_m:
+            assert found.without_sight is not None
+            assert found.placement.value > found.without_sight
+        elif sight_m is None:  # but for places in round numbers the same
+            assert found.placement.value == pytest.approx(found.without_sight, rel=1e-4)
+        assert found.standing.crossed in (None, 0)
+    assert searched == [(None, True, (2, 4)), (8.0, True, (4, 4)), (0.0, False, (2, 2))]

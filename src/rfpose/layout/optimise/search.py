@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
 from rfpose.engine import gathered
@@ -198,8 +199,14 @@ def _rows(
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Search on one core: a few hundred points and tiny matrices, where threads only wait for each other."""
-    with one_thread(), threadpool_limits(1, user_api="blas"):
+    with one_thread(), _blas().limit(limits=1, user_api="blas"):
         yield
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    """Return the hold on BLAS, which takes milliseconds to find; it is loaded by now."""
+    return ThreadpoolController()
 
 
 def statistic_of(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:

@@ -483,16 +483,20 @@ def optimise(
     now = task.scenario.transmitter_enu_m
     step_m, sight = _step_m(now), task.constraints.sight
     n, tell = n_transmitter or len(now), on_progress or (lambda _done, _total: None)
-    twice = sight is not None and criterion != SITE  # which would take too long
-    if sight is not None:  # still clear of it when places are rounded
-        wide = replace(sight, clearance_m=sight.clearance_m + step_m)
+    # still clear of it when places are rounded
+    wide = None if sight is None else replace(sight, clearance_m=sight.clearance_m + step_m)
+    if wide is not None:
         task = replace(task, constraints=replace(task.constraints, sight=wide))
     with naming(scenario):
-        found = task.place(n, lambda k, total: tell(k, (1 + twice) * total))
-        without = None
-        if twice:
+        if wide is None or criterion == SITE:  # which would take too long twice
+            found, without = task.place(n, tell), None
+        else:
             free = replace(task, constraints=replace(task.constraints, sight=None))
-            without = free.place(n, lambda k, total: tell(total + k, 2 * total)).value
+            found = free.place(n, lambda k, total: tell(k, 2 * total))
+            without = found.value
+            # the best of all places is the best of those in no line, if it is one of them
+            if wide.crossed(found.transmitter_enu_m[task.keep :]):
+                found = task.place(n, lambda k, total: tell(total + k, 2 * total))
         new = step_m * np.round(found.transmitter_enu_m[task.keep :] / step_m)
         places = np.vstack([now[: task.keep], new])
         better = task.scenario.with_transmitters(maps.check_site(places))
