@@ -303,7 +303,7 @@ class _Grid:
         between
             Called while nothing is to be done.
         """
-        news_at, known, look_s = time.monotonic(), self._reached(), _LOOK_S
+        news_at, known = time.monotonic(), self._recording.reached()
         until = None if self._follow.until_s is None else self._follow.until_s * self._recording.sample_rate
         while True:
             start = self._next()
@@ -316,25 +316,28 @@ class _Grid:
                 continue
             if not self._recording.grows and self._waiting is None:
                 return
+            if not self._wait_for_news(known, news_at, between):
+                return
+            reached = self._recording.reached()
+            if reached != known:
+                news_at, known = time.monotonic(), reached
+
+    def _wait_for_news(self, known: dict[str, int], since: float, between: Callable[[], None]) -> bool:
+        """Wait until more was recorded, or a receiver may not be waited for any more; False: nothing came in time."""
+        while True:
             check()
             between()
             looked_at = time.monotonic()
             self._recording.refresh()
-            reached = self._reached()
             now = time.monotonic()
-            if reached != known:
-                news_at, known, look_s = now, reached, _LOOK_S
-                continue
-            if self._follow.idle_timeout_s is not None and now - news_at > self._follow.idle_timeout_s:
-                return
+            if self._recording.reached() != known:
+                return True
+            if self._follow.idle_timeout_s is not None and now - since > self._follow.idle_timeout_s:
+                return False
             # a recording of many channels takes long to look at, and the recorder needs the disk too
-            look_s = max(_LOOK_S, 2.0 * (now - looked_at))
-            time.sleep(look_s)
-
-    def _reached(self) -> dict[str, int]:
-        """Return by receiver the sample up to which it is recorded."""
-        rows = {name: self._recording.blocks(name) for name in self._recording.receiver_ids}
-        return {name: int(blocks[-1].sum()) for name, blocks in rows.items() if len(blocks)}
+            time.sleep(max(_LOOK_S, 2.0 * (now - looked_at)))
+            if self._waiting is not None:
+                return True
 
     def _next(self) -> int | None:
         """Return the next frame if it is complete."""
@@ -357,7 +360,7 @@ class _Grid:
 
     def _is_ready(self, start: int) -> bool:
         """Tell whether all receivers have recorded a frame, or are not waited for any more."""
-        reached = self._reached()
+        reached = self._recording.reached()
         lagging = {
             name for name in reached if name in self._wanted and not self._has_passed(name, start, reached[name])
         }

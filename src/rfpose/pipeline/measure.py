@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
-from rfpose.engine import Team, team_here, team_of
+from rfpose.engine import Team, n_core, team_here, team_of
 from rfpose.errors import RecordingError
 from rfpose.pipeline.formats.journal import Entry, Journal
 from rfpose.pipeline.stages import Stopwatch
@@ -35,6 +35,9 @@ giving them out costs little."""
 
 _FOR_THREADS_SAMPLES = 200_000
 """Of a frame; in shorter ones a kernel takes less time than it takes a thread to get the interpreter back."""
+_PER_THREAD_HERE = 16
+"""The same for each thread here, to which they go in no time."""
+
 _MAX_ENTRY_ROWS = 4096
 _PROBE_SAMPLES = 1024
 _CLOCK_STATE = "clock_state_ppm"
@@ -235,10 +238,10 @@ class FrameByFrame:
             tone_hz=scenario.tone_hz,
             frame_start_index=starts,
         )
-        rows = np.array_split(np.arange(n_receiver), min(n_receiver, _PER_THREAD * self._team.n_at_once))
-        wanted = [_Wanted(0, n_receiver, row, self._clock_ppm[row]) for row in rows]
+        groups = _groups(n_receiver, _PER_THREAD_HERE * self._team.n_at_once)
+        wanted = [_Wanted(0, n_receiver, group, self._clock_ppm[group]) for group in groups]
         for i, measured in self._team.map(_measure_here, wanted, self._bench):
-            self._clock_ppm[rows[i]] = measured.clock_ppm
+            self._clock_ppm[groups[i]] = measured.clock_ppm
             for row, found in measured.rows:
                 tones.put(*divmod(row, n_receiver), found)
         return tones
@@ -299,14 +302,18 @@ def _team_here(scenario: Scenario) -> contextlib.AbstractContextManager[Team]:
     return team_here(alone=scenario.radio.frame_samples < _FOR_THREADS_SAMPLES)
 
 
+def _groups(n_receiver: int, n_task: int) -> list[npt.NDArray[np.int64]]:
+    """Return the receivers of at most so many tasks."""
+    return np.array_split(np.arange(n_receiver), min(n_receiver, n_task))
+
+
 def _share_here(bench: _Bench, n_receiver: int) -> _Share:
-    groups = [np.array([i]) for i in range(n_receiver)]
+    groups = _groups(n_receiver, _PER_THREAD_HERE * n_core())
     return _Share(bench.rows_of(JOURNAL_SAMPLES), groups, _measure_here, bench)
 
 
 def _share_elsewhere(bench: _Bench, elsewhere: OtherProcesses, team: Team) -> _Share:
-    n_task = min(bench.n_receiver, _PER_THREAD * team.n_at_once)
-    groups = np.array_split(np.arange(bench.n_receiver), n_task)
+    groups = _groups(bench.n_receiver, _PER_THREAD * team.n_at_once)
     place = _Place(
         paths=tuple(path.absolute() for path in elsewhere.paths),
         follow_links=elsewhere.follow_links,
@@ -329,8 +336,8 @@ class _Bench:
         self._receiver_ids = recipe.scenario.receiver_ids
         self._n_sample = recipe.scenario.radio.frame_samples
         self._extractor_of = extractors(recording, recipe.scenario, recipe.estimator)
-        # not every format's library can be called from several threads at once
-        self._lock = contextlib.nullcontext() if recording.serves_threads else threading.Lock()
+        lock = contextlib.nullcontext() if recording.reads_side_by_side else threading.Lock()
+        self._reading: contextlib.AbstractContextManager[Any] = lock
         self._own = threading.local()
 
     @property
@@ -367,7 +374,7 @@ class _Bench:
         receiver_id, start = self._receiver_ids[i_receiver], int(self.recipe.frame_start_index[i_frame])
         if receiver_id not in self.recording.receiver_ids:
             return LineStatus.NOT_RECORDED
-        with self._lock:
+        with self._reading:
             begin = self.recording.frame_at(receiver_id, start, self._n_sample)
             if begin is None:
                 return LineStatus.GAP

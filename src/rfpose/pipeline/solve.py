@@ -30,7 +30,7 @@ from rfpose.pipeline.choice import POSES, PoseChoice, choose
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result
 from rfpose.pipeline.rigid import RigidMemory, RigidOutcome, solve_rigid_poses
 from rfpose.pipeline.stages import Stopwatch
-from rfpose.scenario import Scenario
+from rfpose.scenario import Heliostat, Scenario
 from rfpose.truth import Truth
 
 if TYPE_CHECKING:
@@ -235,20 +235,25 @@ def _sides(scenario: Scenario) -> list[Side]:
     middle = scenario.transmitter_enu_m.mean(axis=0)
     up = np.linalg.svd(scenario.transmitter_enu_m - middle)[2][-1]
     up = up if up[2] >= 0.0 else -up
+
+    def side(place: npt.ArrayLike, reach: float) -> Side:
+        height = float((np.array(place) - middle) @ up)
+        return None if abs(height) <= reach else "above" if height > 0.0 else "below"
+
+    def of_mirror(mirror: Heliostat) -> Side:
+        off = _UNSURVEYED_M if mirror.pivot_sigma_m is None else _SURVEY_SIGMAS * mirror.pivot_sigma_m
+        width = np.linalg.norm(np.array(mirror.receiver_mirror_m), axis=1).max()
+        return side(mirror.pivot_enu_m, float(width) + mirror.arm_m + off)
+
+    calibration = [side(c.position_enu_m, _SURVEY_SIGMAS * c.survey_sigma_m) for c in scenario.calibration_receiver]
+    mirrors = [of_mirror(mirror) for mirror in scenario.heliostat]
     out: list[Side] = []
     for receiver in scenario.receivers:
         if receiver.heliostat is None:
             assert receiver.calibration is not None
-            kept = scenario.calibration_receiver[receiver.calibration]
-            place, reach = np.array(kept.position_enu_m), _SURVEY_SIGMAS * kept.survey_sigma_m
+            out.append(calibration[receiver.calibration])
         else:
-            mirror = scenario.heliostat[receiver.heliostat]
-            place = np.array(mirror.pivot_enu_m)
-            off = _UNSURVEYED_M if mirror.pivot_sigma_m is None else _SURVEY_SIGMAS * mirror.pivot_sigma_m
-            width = np.linalg.norm(np.array(mirror.receiver_mirror_m), axis=1).max()
-            reach = float(width) + mirror.arm_m + off
-        height = float((place - middle) @ up)
-        out.append(None if abs(height) <= reach else "above" if height > 0.0 else "below")
+            out.append(mirrors[receiver.heliostat])
     return out
 
 

@@ -66,6 +66,8 @@ _FRAME_PER_SHIFT: Final = 4
 """A receiver's own frame lies at most this part of a frame beside the common one: much of it is the same stretch of
 time, in which the mirrors are taken to stand still."""
 
+_FEW_ROWS: Final = 4
+
 
 class GapError(RecordingError):
     """Samples were asked for that the receiver did not record."""
@@ -133,8 +135,8 @@ class Recording(ABC):
 
     grows: ClassVar[bool] = False
     """Whether `refresh` may find more than there was when it was opened."""
-    serves_threads: ClassVar[bool] = False
-    """Whether several threads may read different receivers at once."""
+    reads_side_by_side: ClassVar[bool] = False
+    """Whether several threads may `read` at once; not every format's library can be called so."""
 
     def __init__(
         self,
@@ -307,6 +309,17 @@ class Recording(ABC):
         """Return the radio frequency at baseband zero of a receiver [Hz]; None when the file does not say."""
         return self.tunings.get(receiver_id, self.centre_frequency_hz)
 
+    def reached(self) -> dict[str, int]:
+        """Return by receiver, of those that recorded anything, the sample up to which it is recorded.
+
+        Raises
+        ------
+        RecordingError
+            The file is damaged.
+        """
+        rows = {name: self.blocks(name) for name in self.receiver_ids}
+        return {name: int(blocks[-1, 0]) + int(blocks[-1, 1]) for name, blocks in rows.items() if len(blocks)}
+
     def covers(self, receiver_id: str, start_index: int, count: int) -> bool:
         """Tell whether a receiver recorded all of ``count`` samples from ``start_index`` on."""
         return self._recorded_from(receiver_id, start_index) >= count
@@ -389,10 +402,10 @@ class Recording(ABC):
     # -- helpers -----------------------------------------------------------------------------------------
 
     def _segments_of(self, receiver_id: str) -> IndexArray:
-        if receiver_id not in self.receiver_ids:
-            names = ", ".join(self.receiver_ids[:8]) + (", …" if len(self.receiver_ids) > 8 else "")
-            raise InvalidInputError(f"`receiver_id` must be one of {names}; got {receiver_id!r} for {self.path}")
         if receiver_id not in self._segments:
+            if receiver_id not in self.receiver_ids:
+                names = ", ".join(self.receiver_ids[:8]) + (", …" if len(self.receiver_ids) > 8 else "")
+                raise InvalidInputError(f"`receiver_id` must be one of {names}; got {receiver_id!r} for {self.path}")
             self._segments[receiver_id] = self._load_segments(receiver_id)
         return self._segments[receiver_id]
 
@@ -520,10 +533,23 @@ def _best_offsets(recording: Recording, runs: IndexArray, frame_samples: int) ->
 
 def merge_rows(rows: IndexArray) -> IndexArray:
     """Join rows [start, count], sorted by start, that touch or overlap."""
-    if len(rows) < 2:
-        return rows.reshape(-1, 2).astype(np.int64)
+    if len(rows) == 0:
+        return np.empty((0, 2), np.int64)
+    if len(rows) <= _FEW_ROWS:
+        return _merge_few(rows)
     start = rows[:, 0]
     reached = np.maximum.accumulate(start + rows[:, 1])
     opens = np.concatenate([[True], start[1:] > reached[:-1]])
     closes = np.concatenate([opens[1:], [True]])
     return np.stack([start[opens], reached[closes] - start[opens]], axis=1)
+
+
+def _merge_few(rows: IndexArray) -> IndexArray:
+    """Do what `merge_rows` does for so few rows that numpy takes longer: of hundreds of receivers each has one."""
+    merged: list[list[int]] = []
+    for start, count in rows.tolist():
+        if merged and start <= sum(merged[-1]):
+            merged[-1][1] = max(merged[-1][1], start + count - merged[-1][0])
+        else:
+            merged.append([start, count])
+    return np.array(merged, np.int64)

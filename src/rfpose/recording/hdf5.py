@@ -14,7 +14,7 @@ import h5py
 from rfpose.errors import RecordingError
 from rfpose.recording.links import FOLLOW
 
-__all__ = ["FROM_SAMPLES", "FROM_TABLE", "PlainFile", "find_dataset", "find_item", "printable"]
+__all__ = ["FROM_SAMPLES", "FROM_TABLE", "find_dataset", "find_item", "printable"]
 
 FROM_SAMPLES: Final = 1100
 """As many bytes as one stored byte may stand for in samples, which are read piece by piece: what deflate reaches."""
@@ -168,82 +168,3 @@ def _check_filter(where: str, code: int, name: bytes) -> None:
             f"{where} is compressed by the HDF5 filter {code} ({called:.40}), which is not installed; install it with "
             "`pip install hdf5plugin`, or write the file again without it (`h5repack -f NONE`)"
         )
-
-
-class PlainFile:
-    """Reads uncompressed datasets of an open file beside the HDF5 library, which serves one thread at a time.
-
-    Parameters
-    ----------
-    file
-        Open, of this machine's own file system.
-    """
-
-    def __init__(self, file: h5py.File) -> None:
-        access, create = file.id.get_access_plist(), file.id.get_create_plist()
-        is_plain = access.get_driver() == h5py.h5fd.SEC2 and create.get_userblock() == 0
-        self._descriptor: int | None = file.id.get_vfd_handle() if is_plain else None
-        self._chunks: dict[int, tuple[int, int] | None] = {}
-
-    def read(self, dataset: h5py.Dataset, first: int, target: memoryview) -> bool:
-        """Fill a buffer with a dataset's items, as they are stored.
-
-        Parameters
-        ----------
-        dataset
-            Of this file and with one axis.
-        first
-            The first item.
-        target
-            Bytes of so many items.
-
-        Returns
-        -------
-        bool
-            False: they are not stored as they are, or not all; the HDF5 library knows what is to be said of it.
-
-        Raises
-        ------
-        OSError, RuntimeError
-            They cannot be read.
-        """
-        if dataset.id.id not in self._chunks:
-            self._chunks[dataset.id.id] = _plain_chunk(dataset)
-        plain = self._chunks[dataset.id.id]
-        if self._descriptor is None or plain is None:
-            return False
-        item, length = plain
-        at, done = first * item, 0
-        if length == 0:
-            offset = dataset.id.get_offset()
-            return offset is not None and _pread(self._descriptor, target, offset + at)
-        while done < len(target):
-            i_chunk, skip = divmod(at + done, length * item)
-            offset = dataset.id.get_chunk_info_by_coord((i_chunk * length,)).byte_offset
-            take = min(length * item - skip, len(target) - done)
-            if offset is None or not _pread(self._descriptor, target[done : done + take], offset + skip):
-                return False
-            done += take
-        return True
-
-
-def _plain_chunk(dataset: h5py.Dataset) -> tuple[int, int] | None:
-    """Return the bytes of an item and the items of a chunk, 0: there are no chunks; None: not stored as it is."""
-    settings = dataset.id.get_create_plist()
-    item: int = dataset.id.get_type().get_size()
-    if settings.get_layout() == h5py.h5d.CHUNKED and not settings.get_nfilters():
-        return item, int(settings.get_chunk()[0])
-    if settings.get_layout() == h5py.h5d.CONTIGUOUS:  # in another file: no offset
-        return item, 0
-    return None
-
-
-def _pread(descriptor: int, target: memoryview, offset: int) -> bool:
-    """Fill a buffer from a place of a file; False: the file ends before."""
-    done = 0
-    while done < len(target):
-        n_byte = os.preadv(descriptor, [target[done:]], offset + done)
-        if n_byte == 0:
-            return False
-        done += n_byte
-    return True

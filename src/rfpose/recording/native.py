@@ -17,8 +17,10 @@ from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.foreign import exact_rate
 from rfpose.kinds import told_kind
 from rfpose.recording import keys
+from rfpose.recording.alike import Layout
 from rfpose.recording.base import STORED_DTYPE, IndexArray, IqArray, Recording, SampleFormat, as_stored
-from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, PlainFile, find_dataset, find_item, printable
+from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
+from rfpose.recording.stored import StoredSamples, where_stored
 from rfpose.scenario import MAX_SAMPLE_INDEX, Scenario, parse_scenario
 from rfpose.truth import Truth
 
@@ -45,7 +47,7 @@ _TRUTH_AXES: Final[dict[str, tuple[str | int, ...]]] = {
 class NativeRecording(Recording):
     """An rfpose-iq file. Open it through `open_recording`."""
 
-    serves_threads = True
+    reads_side_by_side = True
 
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         self._file = _open_hdf5(path)
@@ -73,8 +75,9 @@ class NativeRecording(Recording):
             for receiver_id in self.receiver_ids:
                 self._iq[receiver_id] = fields.iq(receiver_id, STORED_DTYPE[sample_format])
             self._fields = fields
-            self._plain = None if follow_links else PlainFile(self._file)
             self._offsets: dict[str, IndexArray] = {}
+            self._stored: dict[str, StoredSamples | None] = {}
+            self._file_number = int(self._file.id.get_vfd_handle())
         except BaseException as error:
             self._file.close()
             if isinstance(error, _HDF5_ERRORS) and not isinstance(error, RfposeError):
@@ -83,7 +86,29 @@ class NativeRecording(Recording):
 
     def close(self) -> None:
         """Close the file."""
+        self._file_number = -1  # another file may get the number
         self._file.close()
+
+    def layout(self) -> Layout | None:
+        """Return by what other files are known to be like this one; None: only HDF5 can read it."""
+        samples, tables, free = {}, {}, []
+        try:
+            for name in self.receiver_ids:
+                stored = self._where(name)
+                begin = self._fields.place_of_blocks(name)
+                if stored is None or begin is None:
+                    return None
+                tables[name] = begin, np.column_stack([self._segments_of(name), self._offsets[name]])
+                samples[name] = stored
+            free = self._fields.places_of_truth()
+            return Layout(self, samples=samples, tables=tables, free=free, file_number=self._file_number)
+        except (*_HDF5_ERRORS, RecordingError):  # told when it is read
+            return None
+
+    def _where(self, receiver_id: str) -> StoredSamples | None:
+        if receiver_id not in self._stored:
+            self._stored[receiver_id] = where_stored(self._iq[receiver_id])
+        return self._stored[receiver_id]
 
     def _load_segments(self, receiver_id: str) -> IndexArray:
         try:
@@ -98,12 +123,14 @@ class NativeRecording(Recording):
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         first = int(self._offsets[receiver_id][i_segment]) + skip
-        dataset = self._iq[receiver_id]
+        target = as_stored(out, self.sample_format)
         try:
-            if self._plain is not None and self._plain.read(dataset, first, out.data.cast("B")):
+            stored = self._where(receiver_id)
+            if stored is not None:
+                stored.read(self._file_number, first * target.itemsize, out)
                 return
             # the buffer has the file's own compound type, so HDF5 copies bytes and converts nothing
-            dataset.read_direct(as_stored(out, self.sample_format), np.s_[first : first + len(out)])
+            self._iq[receiver_id].read_direct(target, np.s_[first : first + len(target)])
         except _HDF5_ERRORS as error:
             raise RecordingError(
                 f"{self.path}: cannot read `/{keys.RECEIVERS}/{receiver_id}/{keys.IQ}` at {first}: {error}; copy the "
@@ -147,6 +174,15 @@ def _open_hdf5(path: Path) -> h5py.File:
         raise RecordingError(
             f"{path}: cannot open: {error.strerror or error}; check the file and its rights"
         ) from error
+
+
+def _place_of(dataset: h5py.Dataset) -> int | None:
+    """Return where values lie one after the other in their file [byte]; None: they do not."""
+    settings = dataset.id.get_create_plist()
+    if settings.get_layout() != h5py.h5d.CONTIGUOUS or settings.get_external_count():
+        return None
+    begin: int | None = dataset.id.get_offset()
+    return begin
 
 
 class _Fields:
@@ -322,6 +358,21 @@ class _Fields:
             i = int(np.flatnonzero(start[1:] < start[:-1] + count[:-1])[0]) + 1
             raise RecordingError(f"{self._path}: `{place}` row {i} starts before row {i - 1} ends; {_REMEDY}")
         return rows
+
+    def place_of_blocks(self, receiver_id: str) -> int | None:
+        """Return where a receiver's table of blocks lies [byte]; None: nowhere as a whole."""
+        place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
+        return _place_of(self._dataset(place, "a table of int64", within=self._receiver(receiver_id)))
+
+    def places_of_truth(self) -> list[tuple[int, int]]:
+        """Return where numbers of the truth lie, and how long they are [byte]."""
+        found = []
+        for name in _TRUTH_AXES if self._holds(f"/{keys.TRUTH}") else ():
+            if self._holds(f"/{keys.TRUTH}/{name}"):
+                dataset = self._dataset(f"/{keys.TRUTH}/{name}", "numbers")
+                if (begin := _place_of(dataset)) is not None:
+                    found.append((begin, dataset.nbytes))
+        return found
 
     def scenario(self) -> Scenario | None:
         """Return the embedded scenario."""

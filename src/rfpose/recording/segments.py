@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import time
@@ -13,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from rfpose.errors import RecordingError, ScenarioError
+from rfpose.recording.alike import AlikeRecording, Layout
 from rfpose.recording.base import GapError, IndexArray, IqArray, Recording
 from rfpose.recording.manifest import MANIFEST_FILE
 from rfpose.recording.native import NativeRecording
@@ -25,6 +27,8 @@ _log = logging.getLogger(__name__)
 
 _SETTLED_S: Final = 2.0
 """A file that cannot be read and did not change for so long is damaged; before that it may be on its way."""
+_LAYOUTS: Final = 4
+"""Of so many files it is remembered how they are laid out: of a whole frame, and of some with losses."""
 
 
 def open_growing(path: str | Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> Recording | None:
@@ -68,10 +72,11 @@ def open_growing(path: str | Path, *, scenario: Scenario | None = None, follow_l
 class _Segment:
     """One closed file."""
 
-    recording: NativeRecording
-    receiver_ids: frozenset[str]
+    recording: Recording
     end: int
     """Of its last receiver."""
+    blocks: dict[str, IndexArray]
+    """Of each receiver."""
 
 
 class SegmentsRecording(Recording):
@@ -81,7 +86,7 @@ class SegmentsRecording(Recording):
     """
 
     grows = True
-    serves_threads = True
+    reads_side_by_side = True
 
     def __init__(self, path: Path, first: NativeRecording, *, scenario: Scenario | None, follow_links: bool) -> None:
         super().__init__(
@@ -100,6 +105,10 @@ class SegmentsRecording(Recording):
         self._kept: deque[_Segment] = deque()
         self._reached: dict[str, int] = {}
         self._rows: dict[str, list[tuple[_Segment, int]]] = {}
+        self._layouts: dict[int, Layout] = {}
+        """Of files that were opened, by their size."""
+        self._unlike_any: NativeRecording | None = None
+        """What was opened last in full, of which the layout is not known yet."""
         self._take_in(first)
 
     @classmethod
@@ -122,21 +131,52 @@ class SegmentsRecording(Recording):
 
     def refresh(self) -> None:
         """Take in files that appeared since."""
-        for name in _names_after(self.path, self._last_name):
-            found = _opened(self.path / name, self.scenario, follow_links=self._follow_links)
+        names = _names_after(self.path, self._last_name)
+        if not names:
+            self._learn()
+        for name in names:
+            self._learn()
+            found = self._open_next(self.path / name)
             if found is None:  # still on its way, and those after it wait
                 return
             self._last_name = name
-            if isinstance(found, NativeRecording):
+            if isinstance(found, Recording):
                 self._take_in(found)
+
+    def _learn(self) -> None:
+        """Find out how the file is laid out that was opened last; for a moment in which nothing waits."""
+        if self._unlike_any is None:
+            return
+        layout, self._unlike_any = self._unlike_any.layout(), None
+        if layout is not None:
+            self._layouts.pop(layout.n_byte, None)
+            self._layouts[layout.n_byte] = layout
+            if len(self._layouts) > _LAYOUTS:
+                del self._layouts[next(iter(self._layouts))]
+
+    def _open_next(self, path: Path) -> Recording | bool | None:
+        """Open a file, as `_opened`; one that is like another in no time."""
+        with contextlib.suppress(OSError):
+            layout = self._layouts.get(path.stat().st_size)
+            found = None if layout is None else AlikeRecording.opened(path, layout)
+            if found is not None:
+                return found
+        return _opened(path, self.scenario, follow_links=self._follow_links)
 
     def forget(self, before_index: int) -> None:
         """Close files that end before a sample."""
         while len(self._kept) > 1 and self._kept[0].end <= before_index:
-            self._kept.popleft().recording.close()
+            old = self._kept.popleft().recording
+            if old is self._unlike_any:
+                self._learn()
+            old.close()
             self._lay_out()
 
-    def _take_in(self, found: NativeRecording) -> None:
+    def reached(self) -> dict[str, int]:
+        """Return by receiver the sample up to which it was recorded, in files that were let go of, too."""
+        return dict(self._reached)
+
+    def _take_in(self, found: Recording) -> None:
         self._last_name = found.path.name
         blocks = {name: found.blocks(name) for name in found.receiver_ids}
         wrong = self._unlike(found) or next(
@@ -153,13 +193,16 @@ class SegmentsRecording(Recording):
             _log.warning("%s: %s; it is left out", found.path, wrong)
             found.close()
             return
-        reached = {name: int(rows[-1].sum()) for name, rows in blocks.items() if len(rows)}
+        reached = {name: _end(rows) for name, rows in blocks.items() if len(rows)}
         self._reached.update(reached)
-        self.receiver_ids = tuple(dict.fromkeys((*self.receiver_ids, *found.receiver_ids)))
-        self._kept.append(_Segment(found, frozenset(found.receiver_ids), max(reached.values(), default=0)))
+        if self.receiver_ids != found.receiver_ids:
+            self.receiver_ids = tuple(dict.fromkeys((*self.receiver_ids, *found.receiver_ids)))
+        self._kept.append(_Segment(found, max(reached.values(), default=0), blocks))
+        if isinstance(found, NativeRecording):
+            self._unlike_any = found
         self._lay_out()
 
-    def _unlike(self, found: NativeRecording) -> str | None:
+    def _unlike(self, found: Recording) -> str | None:
         for what in ("sample_rate", "centre_frequency_hz", "sample_format", "full_scale"):
             mine, theirs = getattr(self, what), getattr(found, what)
             if mine != theirs:
@@ -175,12 +218,12 @@ class SegmentsRecording(Recording):
         rows = [np.empty((0, 2), np.int64)]
         where: list[tuple[_Segment, int]] = []
         for segment in self._kept:
-            if receiver_id in segment.receiver_ids:
-                blocks = segment.recording.blocks(receiver_id)
-                rows.append(blocks)
-                where.extend((segment, start) for start in blocks[:, 0].tolist())
+            found = segment.blocks.get(receiver_id)
+            if found is not None:
+                rows.append(found)
+                where += [(segment, start) for start in found[:, 0].tolist()]
         self._rows[receiver_id] = where
-        return np.concatenate(rows)
+        return rows[-1] if len(rows) == 2 else np.concatenate(rows)
 
     def _read_segment(self, receiver_id: str, i_segment: int, skip: int, out: IqArray) -> None:
         segment, start = self._rows[receiver_id][i_segment]
@@ -190,6 +233,11 @@ class SegmentsRecording(Recording):
             self.notes = [*self.notes[-99:], str(error)]
             _log.warning("%s; what cannot be read is left out", error)
             raise GapError(str(error)) from error
+
+
+def _end(rows: IndexArray) -> int:
+    """Return where the last of some blocks ends."""
+    return int(rows[-1, 0]) + int(rows[-1, 1])
 
 
 def _names_after(path: Path, name: str) -> list[str]:

@@ -177,8 +177,13 @@ class Scenario(Record):
 
     def receiver_rows(self, i_heliostat: int) -> slice:
         """Rows of the receiver axis that belong to one heliostat."""
-        start = sum(len(h.receiver_ids) for h in self.heliostat[:i_heliostat])
-        return slice(start, start + len(self.heliostat[i_heliostat].receiver_ids))
+        return self.rows_by_heliostat[i_heliostat]
+
+    @cached_property
+    def rows_by_heliostat(self) -> list[slice]:
+        """Rows of the receiver axis that belong to each heliostat."""
+        ends = list(itertools.accumulate(len(h.receiver_ids) for h in self.heliostat))
+        return [slice(end - len(h.receiver_ids), end) for h, end in zip(self.heliostat, ends, strict=True)]
 
     def need_rf_carriers(self, what: str) -> None:
         """Refuse what cannot be told without carriers at radio frequencies above zero.
