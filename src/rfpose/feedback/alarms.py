@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -122,9 +122,7 @@ def _cuts(series: npt.NDArray[np.float64], limit: float, least: int) -> list[int
     n = len(series)
     if n < 2 * least:
         return []
-    from scipy.ndimage import median_filter  # as theilslopes below, slow to load
-
-    x = median_filter(series, size=3, mode="nearest")
+    x = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(series, 1, mode="edge"), 3), axis=1)
     sigma = 1.4826 * float(np.median(np.abs(np.diff(series)))) / np.sqrt(2.0)
     penalty = least * max(limit, 3.0 * sigma) ** 2
     first, second = np.concatenate([[0.0], np.cumsum(x)]), np.concatenate([[0.0], np.cumsum(x**2)])
@@ -170,16 +168,30 @@ def _drift(
     """Total change along a run, if it is sure and beyond one of the limits."""
     if len(part) < 10:
         return None
-    from scipy.stats import theilslopes  # takes a second to load, and only this needs it
-
-    slope, _, low, high = theilslopes(part, alpha=0.997)
-    total = float(slope) * (len(part) - 1)
-    if abs(total) > limit and low * high > 0.0:
+    total = _slope(part, np.arange(len(part))) * (len(part) - 1)
+    if abs(total) > limit and _is_sure(part, None):
         return total
-    span_s = float(unix_s[-1] - unix_s[0])
+    at_s = unix_s - unix_s[0]
+    span_s = float(at_s[-1])
     if not span_s >= _LEAST_SPAN_S:
         return None
-    slope, _, low, high = theilslopes(part, unix_s - unix_s[0], alpha=0.997)
-    total = float(slope) * span_s
-    fast = abs(float(slope)) * _YEAR_S > limit_per_year and abs(total) > _LEAST_DRIFT_RAD
-    return total if fast and low * high > 0.0 else None
+    slope = _slope(part, at_s)
+    total = slope * span_s
+    fast = abs(slope) * _YEAR_S > limit_per_year and abs(total) > _LEAST_DRIFT_RAD
+    return total if fast and _is_sure(part, at_s) else None
+
+
+def _slope(part: npt.NDArray[np.float64], at: npt.NDArray[Any]) -> float:
+    """Median of the slopes between any two (Theil 1950)."""
+    later, earlier = np.tril_indices(len(part), -1)
+    apart = at[later] - at[earlier]
+    slopes = (part[later] - part[earlier])[apart != 0] / apart[apart != 0]
+    return float(np.median(slopes)) if len(slopes) else 0.0
+
+
+def _is_sure(part: npt.NDArray[np.float64], at: npt.NDArray[np.float64] | None) -> bool:
+    """Tell whether zero is outside the slope's interval of confidence (Sen 1968)."""
+    from scipy.stats import theilslopes  # takes a second to load, which the steady ones are spared
+
+    _, _, low, high = theilslopes(part, at, alpha=0.997)
+    return bool(low * high > 0.0)
