@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from rfpose.cli import _app
 from rfpose.cli.track import _METHODS
@@ -110,6 +111,17 @@ def test_stopped_and_resumed_equals_undisturbed(site, tmp_path):
     (tmp_path / ".third.h5.state").write_bytes(b"PK not a state")
     job(tmp_path / "third.h5", seed=5)
     assert (tmp_path / "third.h5").read_bytes() == whole.read_bytes()
+
+
+def test_blas_keeps_to_one_thread(site):
+    def threads(*_now):
+        return [lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"]
+
+    seen = []
+    with threadpool_limits(2, user_api="blas"):
+        track(site, methods=("open-loop",), heliostats=1, on_progress=lambda *now: seen.extend(threads(*now)))
+        assert set(threads()) == {2}
+    assert set(seen) == {1}
 
 
 @pytest.mark.parametrize(
