@@ -11,6 +11,7 @@ import subprocess
 import sys
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -44,62 +45,87 @@ COMPILED = ("numba", "scipy", "pvlib", "matplotlib", "PySide6")
 NO_KERNEL = ("numba", "scipy.stats", "scipy.ndimage", "matplotlib", "PySide6", "pydantic")
 
 
-@pytest.mark.parametrize(
-    ("words", "says", "unloaded"),
-    [
-        ("simulate there -o there", "the same", HEAVY),
-        ("process there.h5 -o there", "exists already", HEAVY),
-        ("convert there.h5 -o there", "exists already", HEAVY),
-        ("track there.toml -o there", "exists already", HEAVY),
-        ("layout map there.toml --csv there", "exists already", HEAVY),
-        ("view absent.h5 --save x.png", "no such file", HEAVY),
-        ("evaluate absent.h5", "no such file", HEAVY),
-        ("info absent.h5", "no such file", HEAVY),
-        ("calibrate absent", "no such file", HEAVY),
-        ("aim absent.json --dish --start 2026-06-21T06:00Z", "no such file", HEAVY),
-        ("demo -o .", "exists already", HEAVY),
-        ("simulate bad.toml -o x.h5", "not valid TOML", COMPILED),
-        ("track bad.toml -o x.h5", "not valid TOML", COMPILED),
-        ("layout map bad.toml", "not valid TOML", COMPILED),
-        ("layout budget bad.toml", "not valid TOML", COMPILED),
-        ("layout optimise bad.toml", "not valid TOML", COMPILED),
-        ("layout tones bad.toml --accuracy-mrad 1", "not valid TOML", COMPILED),
-        ("process bare.h5 -o x.h5", "holds no scenario", COMPILED),
-        ("process bare.h5 --scenario bad.toml -o x.h5", "not valid TOML", COMPILED),
-        ("convert absent.h5 -o x.h5", "no such file", COMPILED),
-        ("evaluate there.h5", "no result", HEAVY),
-        ("calibrate bad.toml", "is no directory", HEAVY),
-        ("info there.h5", "the file is empty", COMPILED),
-        ("info bad.toml", "not valid TOML", COMPILED),
-        ("view there.h5 --save x.png", "the file is empty", COMPILED),
-        ("view bad.toml --save x.png", "not valid TOML", COMPILED),
-        ("view there.h5 --scenario bad.toml --save x.png", "the file is empty", COMPILED),
-        ("aim bad.toml --dish --start 2026-06-21T06:00Z", "not valid TOML", NO_KERNEL),
-        ("calibrate .", "no heliostat folder", NO_KERNEL),
-        ("calibrate --mount bad.toml --drone there", "not valid TOML", NO_KERNEL),
+REFUSED = {
+    HEAVY: [
+        ("simulate there -o there", "the same"),
+        ("process there.h5 -o there", "exists already"),
+        ("convert there.h5 -o there", "exists already"),
+        ("track there.toml -o there", "exists already"),
+        ("layout map there.toml --csv there", "exists already"),
+        ("view absent.h5 --save x.png", "no such file"),
+        ("evaluate absent.h5", "no such file"),
+        ("info absent.h5", "no such file"),
+        ("calibrate absent", "no such file"),
+        ("aim absent.json --dish --start 2026-06-21T06:00Z", "no such file"),
+        ("demo -o .", "exists already"),
+        ("evaluate there.h5", "no result"),
+        ("calibrate bad.toml", "is no directory"),
     ],
-)
-def test_a_refusal_waits_for_nothing_heavy(tmp_path: Path, words: str, says: str, unloaded: tuple[str, ...]) -> None:
+    COMPILED: [
+        ("simulate bad.toml -o x.h5", "not valid TOML"),
+        ("track bad.toml -o x.h5", "not valid TOML"),
+        ("layout map bad.toml", "not valid TOML"),
+        ("layout budget bad.toml", "not valid TOML"),
+        ("layout optimise bad.toml", "not valid TOML"),
+        ("layout tones bad.toml --accuracy-mrad 1", "not valid TOML"),
+        ("process bare.h5 -o x.h5", "holds no scenario"),
+        ("process bare.h5 --scenario bad.toml -o x.h5", "not valid TOML"),
+        ("convert absent.h5 -o x.h5", "no such file"),
+        ("info there.h5", "the file is empty"),
+        ("info bad.toml", "not valid TOML"),
+        ("view there.h5 --save x.png", "the file is empty"),
+        ("view bad.toml --save x.png", "not valid TOML"),
+        ("view there.h5 --scenario bad.toml --save x.png", "the file is empty"),
+    ],
+    NO_KERNEL: [
+        ("aim bad.toml --dish --start 2026-06-21T06:00Z", "not valid TOML"),
+        ("calibrate .", "no heliostat folder"),
+        ("calibrate --mount bad.toml --drone there", "not valid TOML"),
+    ],
+}
+"""What is refused and with which words, by what must not have been loaded for it."""
+SEVERAL = """
+import json, sys
+from rfpose.cli import main
+for words in json.loads(sys.argv[1]):
+    sys.argv[1:] = words.split()
+    done = 0
+    try: main()
+    except SystemExit as ended: done = ended.code
+    loaded = [name for name in json.loads(sys.stdin.readline()) if name in sys.modules]
+    print(json.dumps([words, done or 0, loaded]))
+    print(file=sys.stderr)
+"""
+
+
+def _loaded(folder: Path, given: list[tuple[str, tuple[str, ...]]]) -> tuple[list[Any], list[str]]:
+    """Run commands one after the other in one new process.
+
+    Returns what each came to (words, exit code, those of its modules that had been loaded by then) and its messages.
+    """
+    code = [sys.executable, "-c", SEVERAL, json.dumps([words for words, _ in given])]
+    asked = "".join(json.dumps(modules) + "\n" for _, modules in given)
+    done = subprocess.run(code, input=asked, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    told = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('["')]
+    return told, done.stderr.split("\n\n")
+
+
+@pytest.mark.parametrize("unloaded", REFUSED)
+def test_a_refusal_waits_for_nothing_heavy(tmp_path: Path, unloaded: tuple[str, ...]) -> None:
     """What is loaded, not how long it takes: that depends on the machine."""
     for name in ("there", "there.h5", "there.toml", "spectrum.png"):
         (tmp_path / name).write_text("")
     (tmp_path / "bad.toml").write_text("= 3")
-    if "bare" in words:
-        settings = {"scenario": None, "receiver_ids": ["a"], "sample_rate": Fraction(1), "centre_frequency_hz": None}
-        with RecordingWriter(
-            tmp_path / "bare.h5", **settings, sample_format="int16", full_scale=1.0, provenance={}
-        ) as writer:
-            writer.write("a", 0, np.zeros((9, 2), np.int16))
-    code = (
-        "import sys\nfrom rfpose.cli import main\n"
-        "try: main()\n"
-        "except SystemExit as done: assert done.code == 3\n"
-        f"print([name for name in {unloaded!r} if name in sys.modules])"
-    )
-    command = [sys.executable, "-c", code, *words.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert says in done.stderr
-    assert done.stdout.strip() == "[]"
+    settings = {"scenario": None, "receiver_ids": ["a"], "sample_rate": Fraction(1), "centre_frequency_hz": None}
+    with RecordingWriter(
+        tmp_path / "bare.h5", **settings, sample_format="int16", full_scale=1.0, provenance={}
+    ) as writer:
+        writer.write("a", 0, np.zeros((9, 2), np.int16))
+    found, messages = _loaded(tmp_path, [(words, unloaded) for words, _ in REFUSED[unloaded]])
+    assert found == [[words, 3, []] for words, _ in REFUSED[unloaded]]
+    for (words, says), message in zip(REFUSED[unloaded], messages, strict=False):
+        assert says in message, words
 
 
 SLOW = """
@@ -258,31 +284,21 @@ COMPILER = ("numba.typed.typeddict", "numba.np.polynomial", "numba.np.random.gen
 SLOW_TO_LOAD = ("scipy.linalg", "scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.signal", "matplotlib", "pvlib")
 
 
-@pytest.mark.parametrize(
-    ("words", "unloaded"),
-    [
+def test_a_command_loads_what_it_needs(small_job: Path) -> None:
+    """What is loaded, not how long it takes: start-up is most of a small job's time."""
+    # those that load least come first: what one has loaded is there for the next
+    given = [
+        ("info recording.h5", (*SLOW_TO_LOAD, "scipy.special", "numba", "rfpose.recording.drf", "rfpose.dsp")),
+        ("evaluate result.h5", (*SLOW_TO_LOAD, "scipy.special", "rfpose.recording.drf")),
         (
             "process recording.h5 -o again.h5",
             (*SLOW_TO_LOAD, *COMPILER, "rfpose.pipeline.site", "rfpose.recording.drf"),
         ),
         ("process recording.h5 -o again.h5 --estimator correlator --force", SLOW_TO_LOAD),
-        ("evaluate result.h5", (*SLOW_TO_LOAD, "scipy.special", "rfpose.recording.drf")),
-        ("info recording.h5", (*SLOW_TO_LOAD, "scipy.special", "numba", "rfpose.recording.drf", "rfpose.dsp")),
-        ("layout map site.toml", NO_SCIPY),
-    ],
-)
-def test_a_command_loads_what_it_needs(small_job: Path, words: str, unloaded: tuple[str, ...]) -> None:
-    """What is loaded, not how long it takes: start-up is most of a small job's time."""
-    code = (
-        "import sys\nfrom rfpose.cli import main\n"
-        "try: main()\n"
-        "except SystemExit as done: assert not done.code, done.code\n"
-        f"print('loaded:', [name for name in {unloaded!r} if name in sys.modules])"
-    )
-    command = [sys.executable, "-c", code, *words.split()]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=small_job)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "loaded: []"
+    ]
+    for together in (given, [("layout map site.toml", NO_SCIPY)]):
+        found, _ = _loaded(small_job, together)
+        assert found == [[words, 0, []] for words, _ in together]
 
 
 def test_profile_tells_where_the_time_went(small_job: Path) -> None:

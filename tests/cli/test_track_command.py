@@ -2,11 +2,13 @@
 
 import csv
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from rfpose.cli import _app
 from rfpose.cli.track import _METHODS
@@ -37,19 +39,32 @@ def test_table_json_csv_and_picture(site, tmp_path):
     out, table, picture, series = (tmp_path / name for name in ("run.h5", "run.csv", "run.png", "series.csv"))
     methods = "open-loop,camera-model,radio-both"
     shown = run(
-        site, "-o", out, "--methods", methods, "--csv", table, "--series", series, "--picture", picture, "--json"
+        site,
+        "-o",
+        out,
+        "--methods",
+        methods,
+        "--heliostats",
+        4,
+        "--csv",
+        table,
+        "--series",
+        series,
+        "--picture",
+        picture,
+        "--json",
     )
     assert shown.exit_code == 0, shown.output
     found = json.loads(shown.stdout)
     assert found["ranking"] == ["radio-both", "camera-model", "open-loop"]
-    assert found["heliostats"] == 12
+    assert found["heliostats"] == 4
     assert found["days"] == ["2026-03-20"]
     assert found["methods"]["radio-both"]["normal_mrad"]["rms"] < 0.3
     assert found["methods"]["open-loop"]["outages"] == []
     assert picture.read_bytes().startswith(b"\x89PNG")
     with table.open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 36
+    assert len(rows) == 12
     assert is_track(out)
     kept = open_track(out)
     written = ("result", "csv", "parquet", "series", "picture")
@@ -67,36 +82,46 @@ def test_table_json_csv_and_picture(site, tmp_path):
     assert tracking == kept.methods["radio-both"].series["mode_count"][:, Mode.TRACK].tolist()
     assert kept.scenario == load_scenario(site)
     assert kept.methods["radio-both"].series["normal_enu"].shape == (len(kept.unix_s), len(kept.stored), 3)
-    plain = run(site, "-o", tmp_path / "again.h5", "--methods", "open-loop")
+    plain = run(site, "-o", tmp_path / "again.h5", "--methods", "open-loop", "--heliostats", 4)
     assert plain.exit_code == 0
     assert "open-loop" in plain.output
 
 
 def test_stopped_and_resumed_equals_undisturbed(site, tmp_path):
     whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
-    track(site, whole, methods=("bias", "radio-both"), seed=5)
+    job = partial(track, site, methods=("bias", "radio-both"), heliostats=3)
+    job(whole, seed=5)
 
     def stop(done, total):
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        track(site, parts, methods=("bias", "radio-both"), seed=5, checkpoint_s=0.0, on_progress=stop)
+        job(parts, seed=5, checkpoint_s=0.0, on_progress=stop)
     assert not parts.exists()
     with pytest.raises(RecordingError, match=r"another job \(different: seed\)"):
-        track(site, parts, methods=("bias", "radio-both"), seed=6)
+        job(parts, seed=6)
     seen = []
-    resumed = track(
-        site, parts, methods=("bias", "radio-both"), seed=5, on_progress=lambda done, total: seen.append(done)
-    )
+    resumed = job(parts, seed=5, on_progress=lambda done, total: seen.append(done))
     assert seen == [3]
     assert parts.read_bytes() == whole.read_bytes()
     assert resumed.settings["seed"] == "5"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["parts.h5", "site.toml", "whole.h5"]
     # a damaged state is no obstacle: the run begins anew
     (tmp_path / ".third.h5.state").write_bytes(b"PK not a state")
-    track(site, tmp_path / "third.h5", methods=("bias", "radio-both"), seed=5)
+    job(tmp_path / "third.h5", seed=5)
     assert (tmp_path / "third.h5").read_bytes() == whole.read_bytes()
+
+
+def test_blas_keeps_to_one_thread(site):
+    def threads(*_now):
+        return [lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"]
+
+    seen = []
+    with threadpool_limits(2, user_api="blas"):
+        track(site, methods=("open-loop",), heliostats=1, on_progress=lambda *now: seen.extend(threads(*now)))
+        assert set(threads()) == {2}
+    assert set(seen) == {1}
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from rfpose import engine
 from rfpose.engine import Engine, team_here, team_of
@@ -26,6 +27,13 @@ from rfpose.scenario import load_scenario
 
 distributed = pytest.importorskip("distributed", reason="needs the extra `distributed`")
 ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def threads_of_blas() -> Iterator[None]:
+    """Here two, as on a user's machine, whatever the tests run with; the workers keep to one."""
+    with threadpool_limits(2, user_api="blas"):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -78,8 +78,17 @@ def test_right_clocks_are_left_alone(wandering, tmp_path):
     assert len(rf.process(cut(wandering, tmp_path, {})).frame_start_index) == 25
 
 
-def test_tones_that_do_not_wander_cannot_tell_and_it_is_said(tmp_path, caplog):
-    given = cut(simulated(tmp_path, frame_count=4), tmp_path, {"H02": 18})
+def test_delays_of_the_receivers_that_wander_too_are_no_hindrance(tmp_path):
+    path = simulated(
+        tmp_path, frame_count=25, transmitter_phase_drift_rad_per_sqrt_h=20.0, receiver_delay_drift_s_per_sqrt_min=4e-8
+    )
+    with pytest.raises(RecordingError, match=r"the clock of H02.h5 is 18 s ahead"):
+        rf.process(cut(path, tmp_path, {"H02": 18}))
+
+
+@pytest.mark.parametrize("frame_count", [4, 24], ids=["none in common", "some in common"])
+def test_tones_that_do_not_wander_cannot_tell_and_it_is_said(tmp_path, caplog, frame_count):
+    given = cut(simulated(tmp_path, frame_count=frame_count), tmp_path, {"H02": 18})
     rf.process(given)
     (said,) = [record.message for record in caplog.records if "beside the other parts" in record.message]
     assert "H02.h5 lies beside the other parts in time, and would not if its clock were 18 s ahead" in said

@@ -38,6 +38,8 @@ def malan(*, worm_rad=0.0, fit_worm=False):
                 "fixed": {**TABLE_6_1, "worm_2_sin_rad": worm_rad, "worm_2_cos_rad": 0.0},
             },
             "drive": {"microsteps": 8},
+            "field_control": None,
+            "event": None,
             "camera": {"interval_days": 8.0, "points_per_day": 20, "spot_sigma_mm": 10.0, "worm": fit_worm},
         },
     )

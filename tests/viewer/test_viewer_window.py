@@ -638,7 +638,9 @@ def test_tracking_run_is_played_and_scrubbed(
     from rfpose.pipeline.track import track
 
     path = tmp_path_factory.mktemp("track") / "day.h5"
-    run = track(shipped_scenario("tracking_100m.toml"), path, methods=["open-loop", "encoder"], heliostats=6)
+    hours = {"first_hour": 11.0, "last_hour": 12.0}
+    short = load_scenario(shipped_scenario("tracking_100m.toml")).changed(tracking=hours)
+    run = track(short, path, methods=["open-loop", "encoder"], heliostats=6)
     window.open_path(path)
     wait(window, lambda: window.session.document is not None)
     assert window.current() == "tracking"
