@@ -22,7 +22,7 @@ from rfpose.kinds import kind_of
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, RangeDifferences, RangeStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.multilat.rigid.pose import PRIORS
+from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.columns import (
     ENU,

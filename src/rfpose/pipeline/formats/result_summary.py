@@ -16,7 +16,7 @@ from rfpose.dsp import LineStatus
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.multilat.rigid.pose import PRIORS
+from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.pipeline.formats.result import (
     DelayTable,
     FilteredTable,
