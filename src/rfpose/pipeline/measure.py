@@ -158,8 +158,10 @@ def measure_tones(
             for i, measured in team.map(share.measure, wanted, share.shared):
                 clock_ppm[wanted[i].i_receiver] = measured.clock_ppm
                 for row, found in measured.rows:
-                    tones.put(*divmod(row, n_receiver), found)
-                stages.add(measured.seconds, measured.samples)
+                    _put(rows, row, found)
+                for name, seconds in measured.seconds.items():
+                    stages.seconds[name] += seconds
+                stages.samples += measured.samples
                 done += len(measured.rows)
                 if on_progress is not None and measured.rows:
                     on_progress(done, n_row)
@@ -233,12 +235,13 @@ class FrameByFrame:
             tone_hz=scenario.tone_hz,
             frame_start_index=starts,
         )
+        arrays = _rows(tones)
         rows = [np.array([i]) for i in range(n_receiver)]
         wanted = [_Wanted(0, n_receiver, row, self._clock_ppm[row]) for row in rows]
         for i, measured in self._team.map(_measure_here, wanted, self._bench):
             self._clock_ppm[rows[i]] = measured.clock_ppm
             for row, found in measured.rows:
-                tones.put(*divmod(row, n_receiver), found)
+                _put(arrays, row, found)
         return tones
 
 
@@ -246,6 +249,12 @@ def _rows(tones: TonePhases) -> Entry:
     """Return views of the arrays with frame and receiver in one axis."""
     arrays = {name: getattr(tones, name) for name in FrameTones.__dataclass_fields__}
     return {name: array.reshape(-1, *array.shape[2:], copy=False) for name, array in arrays.items()}
+
+
+def _put(rows: Entry, row: int, found: FrameTones) -> None:
+    """Store one frame of one receiver."""
+    for name, values in rows.items():
+        values[row] = getattr(found, name)
 
 
 # -- how the work is shared ----------------------------------------------------------------------------------

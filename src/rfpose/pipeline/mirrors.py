@@ -25,7 +25,7 @@ from rfpose.scenario import Scenario
 IntArray = npt.NDArray[np.int64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "mirror_groups", "mirror_problems"]
+__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "carrier_sigma_rad", "mirror_groups", "mirror_problems"]
 
 _VAGUE_RATIO = 100.0
 """A calibration off by so many times what the pivot is off by tells nothing of the pose."""
@@ -172,7 +172,7 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
     tones, calibration = inputs.tones, inputs.calibration
     calibrated = inputs.scenario.is_calibrated
     sigma, common = group.range_noise(
-        tones.sigma_rad, tones.carrier_sigma_rad, calibration.sigma_rad if calibrated else None
+        tones.sigma_rad, carrier_sigma_rad(tones), calibration.sigma_rad if calibrated else None
     )
     out = []
     for k, q in enumerate(group.waves.tone):
@@ -198,6 +198,12 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
             )
         )
     return out
+
+
+def carrier_sigma_rad(tones: TonePhases) -> FloatArray:
+    """(frame, receiver, transmitter) standard deviation of the carriers' phases [rad]."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(tones.carrier_sigma / np.abs(tones.carrier))
 
 
 def _coarse(z: FloatArray, difference_m: FloatArray, reference: FloatArray, wavelength: float) -> FloatArray:

@@ -17,10 +17,10 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.measurement import estimator_of, noise_of, simulated_ground, wavelengths_of
-from rfpose.multilat.fix import check_transmitters
 from rfpose.multilat.ground import solve_with_ground
 from rfpose.multilat.ground.model import range_shift_m
 from rfpose.multilat.rigid import MirrorProblem, Observation, part_of, rigid_bound
+from rfpose.multilat.transmitters import check_transmitters
 from rfpose.scenario import Scenario
 
 __all__ = ["RadioByPosture", "RadioErrors"]
