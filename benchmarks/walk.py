@@ -97,9 +97,9 @@ def from_phases(steps: list[Step]) -> list[Step]:
 
 
 def small_recording() -> rf.Recording:
-    """Return two mirrors in two frames."""
+    """Return two mirrors in two frames, so long that threads measure them."""
     site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
-    small = {"radio": {"frame_samples": 8_000}, "simulation": {"frame_count": 2}}
+    small = {"radio": {"frame_samples": 200_000}, "simulation": {"frame_count": 2}}
     return rf.simulate(site.changed(heliostat=site.heliostat[:2], **small), seed=1)
 
 

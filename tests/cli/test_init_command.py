@@ -15,7 +15,7 @@ from rfpose.cli._app import app
 from rfpose.cli.init import KIND_NAMES, UNITS
 from rfpose.pipeline.choice import POSES
 from rfpose.pipeline.samples.paint import ORIGIN, write_paint
-from rfpose.pipeline.solve import check_solvable
+from rfpose.pipeline.solvable import check_solvable
 from rfpose.pipeline.starter import KINDS
 from rfpose.scenario import PositionForm, load_scenario
 from rfpose.scenario.schema import scenario_schema

@@ -13,6 +13,7 @@ from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.integrity.guard import limit, noncentrality
 from rfpose.multilat.integrity.hypotheses import judge
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, solve_rigid
+from rfpose.multilat.rigid.weights import equations_of
 from sites import TABLE_2
 
 TRANSMITTER = 100.0 * TABLE_2
@@ -81,7 +82,7 @@ def test_without_errors_every_statistic_is_chi2_and_alarms_are_as_rare_as_stated
     for stat, dof in ((verdict.stat, verdict.dof), (verdict.link, verdict.link_dof)):
         mean, expected = stat.mean(axis=0), dof[0]
         assert np.all(np.abs(mean - expected) < 5.0 * np.sqrt(2.0 * expected / n) + 1e-9)
-    dof = field.problem(field.z).dof
+    dof = equations_of(field.problem(field.z)).dof
     assert poses.chi2.mean() == pytest.approx(dof[0], abs=5.0 * np.sqrt(2.0 * dof[0] / n))
     found = field.guarded(field.z, false_alarm=0.05)
     assert np.mean(found.status != IntegrityStatus.OK) < 0.05 + 5.0 * np.sqrt(0.05 / n)

@@ -22,7 +22,8 @@ from rfpose.pipeline.formats.result_summary import summarise
 from rfpose.pipeline.noise import phase_noise
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
-from rfpose.pipeline.solve import check_solvable, solve
+from rfpose.pipeline.solvable import check_solvable
+from rfpose.pipeline.solve import solve
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"

@@ -18,7 +18,7 @@ from rfpose.pipeline.evaluate import Evaluation, evaluate
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
-from rfpose.pipeline.solve import check_solvable
+from rfpose.pipeline.solvable import check_solvable
 from rfpose.scenario import Scenario, load_scenario
 
 SHIPPED = Path(__file__).resolve().parents[2] / "data" / "table2_100m.toml"

@@ -143,12 +143,6 @@ class TonePhases:
     clipped_fraction: FloatArray
     status: npt.NDArray[np.uint8]
 
-    @property
-    def carrier_sigma_rad(self) -> FloatArray:
-        """(frame, receiver, transmitter) standard deviation of the carriers' phases [rad]."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(self.carrier_sigma / np.abs(self.carrier))
-
     @classmethod
     def empty(
         cls,
@@ -179,8 +173,3 @@ class TonePhases:
             clipped_fraction=np.full(frame_receiver, np.nan),
             status=np.full((*frame_receiver, n_transmitter), LineStatus.NOT_RECORDED, np.uint8),
         )
-
-    def put(self, i_frame: int, i_receiver: int, tones: FrameTones) -> None:
-        """Store one frame of one receiver."""
-        for name in FrameTones.__dataclass_fields__:
-            getattr(self, name)[i_frame, i_receiver] = getattr(tones, name)

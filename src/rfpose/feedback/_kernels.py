@@ -494,7 +494,7 @@ def _fit_one(
                     damped[f, g] = normal[f, g]
                 damped[f, f] *= 1.0 + damping
                 step[f] = -gradient[f]
-            if factor(damped, 0.0):
+            if factor(damped, damped.shape[0], 0.0):
                 solve_factored(damped, step)
                 for f in range(n_free):
                     value = p[free[f]] + step[f] * scale[f]

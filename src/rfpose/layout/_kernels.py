@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.jit import kernel, kernel_rows
+from rfpose.multilat.equations._kernels import add_prior
 
 # Smallest share of an unknown's information that the others may leave before it counts as unobserved.
 FLOOR = 1e-13
@@ -575,3 +576,10 @@ def tilt_rigid(begin, end, field, weight, bias_info, group_class, n_class, share
         if not invert(m, q):
             continue
         out[i] = normal_variance(q, rot[i])
+
+
+@kernel_rows
+def prior_rows(begin, end, prior, rot, out):
+    """Information of ``prior`` on [pose, clocks] of each mirror; (mirror, unknown, unknown), lower triangle."""
+    for i in range(begin, end):
+        add_prior(prior, i, rot[i], out[i], 0, 6)

@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.errors import InvalidInputError
+from rfpose.layout import _kernels
 from rfpose.layout.maps import PosedMirrors, plane_slope
 from rfpose.measurement import Estimator, Noise, clock_classes
+from rfpose.multilat.equations import MirrorPrior
 
 __all__ = ["Gain", "ReflectionBend", "gain_of", "normal_gain"]
 
@@ -248,7 +250,7 @@ def _rigid(
     mean = np.einsum("mgrt,mgrtk->mgtk", weight, rows) / np.where(total > 0.0, total, 1.0)[..., None]
     weighed = weight[..., None] * (rows - mean[:, :, None])
     info = np.einsum("mgrtk,mgrtl->mkl", rows, weighed)
-    _add_priors(info, rot, weight, bias_info, classes, n_receiver, estimator)
+    info[:, :n_pose, :n_pose] += _prior(estimator, rot, weight, bias_info, classes)
     flat = weighed.reshape(n_mirror, -1, n_pose + n_shared)
     pose = _inverse(info[:, :n_pose, :n_pose])
     to_normal = np.zeros((n_mirror, 2, n_pose))
@@ -278,29 +280,31 @@ def _clock_columns(classes: npt.NDArray[np.int64], n_receiver: int, *, shared: b
     return out
 
 
-def _add_priors(
-    info: FloatArray,
-    rot: FloatArray,
-    weight: FloatArray,
-    bias_info: FloatArray,
-    classes: npt.NDArray[np.int64],
-    n_receiver: int,
-    estimator: Estimator,
-) -> None:
-    """Pivot, mount, ties between clocks; a common clock that is the transmitters' own is held, which says nothing."""
-    info[:, :3, :3] += np.eye(3) * estimator.pivot_sigma_m**-2.0
-    if estimator.two_axis:
-        roll = np.stack([rot[:, 1, 0], -rot[:, 0, 0]], axis=1)
-        info[:, 3:5, 3:5] += estimator.roll_sigma_rad**-2.0 * roll[:, :, None] * roll[:, None]
-    shared = estimator.clock_sigma_m == 0.0
-    n_clock = 1 if shared else n_receiver
-    for k in range(int(classes.max()) + 1):
-        first = 6 + k * n_clock
+def _prior(
+    estimator: Estimator, rot: FloatArray, weight: FloatArray, bias_info: FloatArray, classes: npt.NDArray[np.int64]
+) -> FloatArray:
+    """(mirror, unknown, unknown) what is known of pose and clocks.
+
+    A common clock that is the transmitters' own is held, which says nothing.
+    """
+    n_mirror, n_class, shared = len(rot), int(classes.max()) + 1, estimator.clock_sigma_m == 0.0
+    n_clock = 1 if shared else weight.shape[2]
+    held = np.zeros((n_mirror, n_class, n_clock))
+    for k in range(n_class):
         if not np.any(bias_info[classes == k] > 0.0):
-            info[:, first, first] += np.maximum(weight[:, classes == k].sum(axis=(1, 2, 3)), 1.0)
-        if not shared and np.isfinite(estimator.clock_sigma_m):
-            tie = np.eye(n_clock) - 1.0 / n_clock
-            info[:, first : first + n_clock, first : first + n_clock] += tie / estimator.clock_sigma_m**2
+            held[:, k, 0] = np.maximum(weight[:, classes == k].sum(axis=(1, 2, 3)), 1.0)
+    tie = 0.0 if shared else estimator.clock_sigma_m**-2.0 / n_clock
+    prior = MirrorPrior(
+        pivot=np.zeros((n_mirror, 3)),
+        pivot_info=np.tile(np.eye(3) * estimator.pivot_sigma_m**-2.0, (n_mirror, 1, 1)),
+        roll_info=np.full(n_mirror, estimator.roll_sigma_rad**-2.0 if estimator.two_axis else 0.0),
+        clock_own=held,
+        clock_tie=np.full((n_mirror, n_class, n_clock, n_clock), tie),
+        clock=np.zeros((n_mirror, n_class, n_clock)),
+    )
+    out = np.zeros((n_mirror, 6 + n_class * n_clock, 6 + n_class * n_clock))
+    _kernels.prior_rows(n_mirror, prior, rot, out)
+    return out + np.swapaxes(np.tril(out, -1), 1, 2)
 
 
 def _inverse(info: FloatArray) -> FloatArray:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.rigid import MirrorKnowledge
 from rfpose.scenario import Heliostat, Scenario
@@ -21,8 +20,8 @@ SCENARIO = "scenario"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Estimator:
-    """How normals are made of phases, and what is known besides.
+class Estimator(MirrorKnowledge):
+    """What a solver is told of mirrors, but for where they stand; and how normals are made of phases.
 
     Attributes
     ----------
@@ -30,25 +29,15 @@ class Estimator:
         For tables and pictures.
     rigid
         All receivers of a mirror in one fit; else each by itself and the plane through them.
-    clock_sigma_m
-        Of each receiver's delay about the mirror's common clock: 0 one shared clock, infinity one a receiver [m].
     carrier
         Use the carrier's phase between a mirror's receivers, too.
-    pivot_sigma_m
-        Survey of the pivot in each axis; infinity: unknown [m].
-    two_axis, roll_sigma_rad
-        An azimuth-elevation mount keeps the mirror's x axis horizontal this well.
     delay_drift_m_per_sqrt_s
         Random walk of unknown delays that are learned over frames [m/√s]; None: they are not.
     """
 
     name: str
     rigid: bool = True
-    clock_sigma_m: float = np.inf
     carrier: bool = False
-    pivot_sigma_m: float = np.inf
-    two_axis: bool = False
-    roll_sigma_rad: float = 1e-6
     delay_drift_m_per_sqrt_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -58,16 +47,6 @@ class Estimator:
             raise InvalidInputError(f"`pivot_sigma_m` must be greater than zero, got {self.pivot_sigma_m}")
         if not self.roll_sigma_rad > 0.0:
             raise InvalidInputError(f"`roll_sigma_rad` must be greater than zero, got {self.roll_sigma_rad}")
-
-    def knowledge(self, pivot_enu_m: FloatArray) -> MirrorKnowledge:
-        """Return what a solver is told of mirrors whose pivots were surveyed to be here (mirror, xyz) [m]."""
-        return MirrorKnowledge(
-            clock_sigma_m=self.clock_sigma_m,
-            pivot_enu_m=pivot_enu_m if np.isfinite(self.pivot_sigma_m) else None,
-            pivot_sigma_m=self.pivot_sigma_m,
-            two_axis=self.two_axis,
-            roll_sigma_rad=self.roll_sigma_rad,
-        )
 
 
 def estimator_of(scenario: Scenario, heliostat: Heliostat) -> Estimator:

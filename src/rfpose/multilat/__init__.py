@@ -4,8 +4,9 @@ from rfpose.multilat.bounds import dop, normal_bound, position_bound, tilt_rms_f
 from rfpose.multilat.filtering import FilteredPoses, FilterSettings, FilterStatus, filter_poses
 from rfpose.multilat.fix import Fixes, FixStatus, locate
 from rfpose.multilat.normal import Normals, Poses, joint_covariance, mirror_normal, solve_poses
-from rfpose.multilat.ranges import RangeDifferences, RangeStatus, check_unambiguous, range_differences
+from rfpose.multilat.ranges import RangeDifferences, RangeStatus, range_differences
 from rfpose.multilat.status import PoseStatus
+from rfpose.multilat.transmitters import check_unambiguous
 
 __all__ = [
     "FilterSettings",

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
-from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.errors import InvalidInputError
 from rfpose.multilat import _kernels
+from rfpose.multilat.transmitters import check_transmitters
 
 __all__ = ["FixStatus", "Fixes", "Side", "locate"]
 
@@ -217,26 +218,6 @@ def locate(
     largest_sigma_m = scale / np.sqrt(np.nanmin(weight, initial=np.inf))
     _judge(result, problem, max_dop, min_probability, ambiguous, largest_sigma_m)
     return Fixes(**{name: read_only(array) for name, array in result.items()})
-
-
-def check_transmitters(transmitter_enu_m: npt.ArrayLike) -> FloatArray:
-    """Return transmitters as (transmitter, xyz or xy); raise `GeometryError` where no receiver could be located."""
-    array = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", "xyz"))
-    n, n_axis = array.shape
-    if n_axis not in (2, 3):
-        raise InvalidInputError(
-            f"`transmitter_enu_m` must have shape (transmitter, 3) or (transmitter, 2), got {array.shape}"
-        )
-    n = len(np.unique(array, axis=0))  # several carriers of one antenna are one place
-    if n < n_axis + 2:
-        raise GeometryError(
-            f"`transmitter_enu_m` must hold {n_axis + 2} or more transmitters, at places of their own, to solve "
-            f"{n_axis} dimensions from range differences, got {n}; add transmitters"
-        )
-    singular = np.linalg.svd(array - array.mean(axis=0), compute_uv=False)
-    if singular[1] <= 1e-9 * singular[0]:
-        raise GeometryError("`transmitter_enu_m` must not lie on one line: a line fixes no position; move some aside")
-    return array
 
 
 def _known_side(side: Side | Sequence[Side], n_receiver: int, n_axis: int) -> FloatArray:

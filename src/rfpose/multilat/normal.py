@@ -12,8 +12,9 @@ from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.geometry import azimuth_elevation_from_enu, cross_matrix, is_collinear
 from rfpose.multilat import _kernels
-from rfpose.multilat.fix import Fixes, FixStatus, Side, check_transmitters, locate
+from rfpose.multilat.fix import Fixes, FixStatus, Side, locate
 from rfpose.multilat.status import PoseStatus
+from rfpose.multilat.transmitters import check_transmitters
 
 __all__ = ["Normals", "Poses", "joint_covariance", "mirror_normal", "solve_poses"]
 

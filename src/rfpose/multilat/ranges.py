@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array, read_only
-from rfpose.errors import GeometryError, InvalidInputError
+from rfpose.errors import InvalidInputError
+from rfpose.multilat.transmitters import check_unambiguous, distances_m
 
-__all__ = ["RangeDifferences", "RangeStatus", "check_unambiguous", "range_differences"]
+__all__ = ["RangeDifferences", "RangeStatus", "range_differences"]
 
 # A finer tone's whole wavelengths are fixed only where a wrong number is less likely than this.
 WRONG_INTEGER_PROBABILITY = 1e-6
@@ -70,35 +71,6 @@ class RangeDifferences:
     calibration_sigma_m: FloatArray
     reference: npt.NDArray[np.int64]
     status: npt.NDArray[np.int8]
-
-
-def check_unambiguous(transmitter_enu_m: npt.ArrayLike, wavelength_m: npt.ArrayLike) -> None:
-    """Refuse a site on which whole wavelengths cannot be known.
-
-    A range difference never exceeds the distance of the two transmitters. So the longest wavelength is long
-    enough when some transmitter has all others within half of it: taken as the reference, it leaves n = 0
-    wherever the receiver is.
-
-    Parameters
-    ----------
-    transmitter_enu_m : (transmitter, xyz)
-        Site ENU frame [m].
-    wavelength_m : (tone,)
-        Wavelengths of the tones [m].
-
-    Raises
-    ------
-    GeometryError
-        No transmitter can serve as reference; the message gives the wavelength to add.
-    """
-    transmitter = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    longest = float(np.max(as_float_array("wavelength_m", wavelength_m, ("tone",), positive=True)))
-    reach = float(np.min(np.max(_distances(transmitter), axis=1)))
-    if reach >= longest / 2.0:
-        raise GeometryError(
-            f"ambiguous: the field is wider than the longest tone wavelength of {longest:.6g} m allows (no transmitter "
-            f"has all others within half of it); add a tone of wavelength above {2.0 * reach:.6g} m"
-        )
 
 
 def range_differences(
@@ -180,7 +152,7 @@ def range_differences(
     variance = own**2 + common**2
     difference_variance = variance + variance[rows, reference][:, None, :]
     difference, fixed, ambiguous = _resolve(
-        difference, difference_variance, wavelength, _distances(transmitter)[reference], reference
+        difference, difference_variance, wavelength, distances_m(transmitter)[reference], reference
     )
     combined, share, uncommon = _combine(difference, np.where(fixed, 1.0 / variance, 0.0))
     combined = combined - combined[rows, reference][:, None]
@@ -202,11 +174,6 @@ def range_differences(
     )
 
 
-def _distances(transmitter_enu_m: FloatArray) -> FloatArray:
-    """(transmitter, transmitter) distances [m]."""
-    return np.asarray(np.linalg.norm(transmitter_enu_m[:, None] - transmitter_enu_m[None], axis=-1))
-
-
 def _broadcast(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     array = as_float_array(name, value, ("...",), finite=False)
     try:
@@ -221,7 +188,7 @@ def _choose_references(
     received: npt.NDArray[np.bool_], transmitter_enu_m: FloatArray, wavelength_m: float
 ) -> npt.NDArray[np.int64]:
     """Choose each row's reference: with most transmitters within half a wavelength, then with the nearest far one."""
-    distance = _distances(transmitter_enu_m)
+    distance = distances_m(transmitter_enu_m)
     patterns, pattern = np.unique(received, axis=0, return_inverse=True)
     choice = np.zeros(len(patterns), np.int64)
     for k, seen in enumerate(patterns):

@@ -13,7 +13,7 @@ from rfpose.geometry import rot_enu_from_mirror
 from rfpose.measurement import reflectors_of
 from rfpose.multilat import normal_bound
 from rfpose.multilat.ground import ground_bound
-from rfpose.multilat.rigid import MirrorProblem, full_covariance, tilt_sigma_rad
+from rfpose.multilat.rigid import MirrorProblem, full_covariance, part_of, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, mirror_groups
@@ -121,7 +121,7 @@ def _rigid(
     out = np.full((len(rot), *2 * (6 + sigma.shape[1] * sigma.shape[2],)), np.nan)
     for rows in shared:
         out[rows] = ground_bound(
-            mirrors.take(rows),
+            part_of(mirrors, mirrors=rows),
             carrier_rf_hz=scenario.carrier_rf_hz,
             tone_hz=group.waves.tone_hz,
             reflectors=reflectors,

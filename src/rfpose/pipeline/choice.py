@@ -1,8 +1,7 @@
-"""Which estimator makes poses of phases: by the command line, else by the scenario; kept in a result's settings."""
+"""Which estimator makes poses of phases: as asked for, else by the scenario."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rfpose.errors import InvalidInputError, ScenarioError
@@ -17,10 +16,6 @@ published. ``rigid``: all phases of a mirror's receivers at once, with what the 
 
 REFLECTIONS = ("estimate", "ignore")
 """What may be asked for instead of what the scenario says of reflections."""
-
-
-_MODELS = ("none", "estimate", "known", "fresnel")
-_SWITCH = ("on", "off")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,37 +38,6 @@ class PoseChoice:
     reflection: str
     integrity: bool
     filtered: bool = False
-
-    @classmethod
-    def of(cls, settings: Mapping[str, str], scenario: Scenario) -> PoseChoice:
-        """Return what a result's settings say; what they do not say is as the scenario has it.
-
-        Raises
-        ------
-        InvalidInputError
-            They say what no estimator of poses is.
-        """
-        for name, allowed in (("reflection", _MODELS), ("integrity", _SWITCH), ("filter", _SWITCH)):
-            if settings.get(name, allowed[0]) not in allowed:
-                raise InvalidInputError(f"`{name}` must be one of {', '.join(allowed)}, got {settings[name]!r:.60}")
-        default = choose(scenario, pose=settings["pose"])
-        if default.pose != "rigid":
-            return default
-        return cls(
-            pose=default.pose,
-            reflection=settings.get("reflection", default.reflection),
-            integrity=settings.get("integrity", "on" if default.integrity else "off") == "on",
-            filtered=settings.get("filter", "on" if default.filtered else "off") == "on",
-        )
-
-    def as_settings(self) -> dict[str, str]:
-        """Return the choice as text for a result file."""
-        return {
-            "pose": self.pose,
-            "reflection": self.reflection,
-            "integrity": "on" if self.integrity else "off",
-            "filter": "on" if self.filtered else "off",
-        }
 
 
 def choose(

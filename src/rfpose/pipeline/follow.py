@@ -22,6 +22,7 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.files import claim
 from rfpose.interruption import check
 from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.choice_text import settings_of
 from rfpose.pipeline.formats.journal import partial_of
 from rfpose.pipeline.formats.live_result import LiveResult, probe_in
 from rfpose.pipeline.formats.result import Result
@@ -135,7 +136,7 @@ def follow_recording(
         note_doubts(opened)
         settings = asked.settings(opened, site, choice)
         grid = _Grid(opened, site, follow)
-        full = settings | {"sample_rate": str(opened.sample_rate), **choice.as_settings()}
+        full = settings | {"sample_rate": str(opened.sample_rate), **settings_of(choice)}
         probe = _probe(opened, site, grid, probe_in(kept))
         live = LiveResult(kept, site, full, probe=probe, restart=force)
         poses = _Poses(opened.sample_rate, site, choice, settings, surveyed)

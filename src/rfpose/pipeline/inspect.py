@@ -62,7 +62,7 @@ def _recording(path: RecordingSource, *, declared: Declared | None, follow_links
 
 def _scenario(scenario: Scenario) -> dict[str, Any]:
     from rfpose.pipeline.choice import POSES
-    from rfpose.pipeline.solve import check_solvable
+    from rfpose.pipeline.solvable import check_solvable
 
     problems = []
     try:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rfpose import __version__
 from rfpose.dsp import FrameTones, LinePlan, LineStatus, ToneExtractor, TonePhases
-from rfpose.engine import Team, n_core, team_here, team_of
+from rfpose.engine import Team, team_here, team_of
 from rfpose.errors import RecordingError
 from rfpose.pipeline.formats.journal import Entry, Journal
 from rfpose.pipeline.stages import Stopwatch
@@ -155,7 +155,7 @@ def measure_tones(
     recipe = _Recipe(scenario=scenario, frame_start_index=frame_start_index, estimator=estimator)
     bench = _Bench(recording, recipe)
     with _team_here(scenario) if elsewhere is None else team_of() as team:
-        share = _share_here(bench, n_receiver) if elsewhere is None else _share_elsewhere(bench, elsewhere, team)
+        share = _share_here(bench, n_receiver, team) if elsewhere is None else _share_elsewhere(bench, elsewhere, team)
         stages.cores = team.n_at_once
         while done < n_row:
             first, end = done, min(done + share.rows, n_row)
@@ -163,8 +163,10 @@ def measure_tones(
             for i, measured in team.map(share.measure, wanted, share.shared):
                 clock_ppm[wanted[i].i_receiver] = measured.clock_ppm
                 for row, found in measured.rows:
-                    tones.put(*divmod(row, n_receiver), found)
-                stages.add(measured.seconds, measured.samples)
+                    _put(rows, row, found)
+                for name, seconds in measured.seconds.items():
+                    stages.seconds[name] += seconds
+                stages.samples += measured.samples
                 done += len(measured.rows)
                 if on_progress is not None and measured.rows:
                     on_progress(done, n_row)
@@ -238,12 +240,13 @@ class FrameByFrame:
             tone_hz=scenario.tone_hz,
             frame_start_index=starts,
         )
+        arrays = _rows(tones)
         groups = _groups(n_receiver, _PER_THREAD_HERE * self._team.n_at_once)
         wanted = [_Wanted(0, n_receiver, group, self._clock_ppm[group]) for group in groups]
         for i, measured in self._team.map(_measure_here, wanted, self._bench):
             self._clock_ppm[groups[i]] = measured.clock_ppm
             for row, found in measured.rows:
-                tones.put(*divmod(row, n_receiver), found)
+                _put(arrays, row, found)
         return tones
 
 
@@ -251,6 +254,12 @@ def _rows(tones: TonePhases) -> Entry:
     """Return views of the arrays with frame and receiver in one axis."""
     arrays = {name: getattr(tones, name) for name in FrameTones.__dataclass_fields__}
     return {name: array.reshape(-1, *array.shape[2:], copy=False) for name, array in arrays.items()}
+
+
+def _put(rows: Entry, row: int, found: FrameTones) -> None:
+    """Store one frame of one receiver."""
+    for name, values in rows.items():
+        values[row] = getattr(found, name)
 
 
 # -- how the work is shared ----------------------------------------------------------------------------------
@@ -307,8 +316,8 @@ def _groups(n_receiver: int, n_task: int) -> list[npt.NDArray[np.int64]]:
     return np.array_split(np.arange(n_receiver), min(n_receiver, n_task))
 
 
-def _share_here(bench: _Bench, n_receiver: int) -> _Share:
-    groups = _groups(n_receiver, _PER_THREAD_HERE * n_core())
+def _share_here(bench: _Bench, n_receiver: int, team: Team) -> _Share:
+    groups = _groups(n_receiver, _PER_THREAD_HERE * team.n_at_once)
     return _Share(bench.rows_of(JOURNAL_SAMPLES), groups, _measure_here, bench)
 
 

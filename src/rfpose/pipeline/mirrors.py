@@ -16,7 +16,7 @@ from rfpose.measurement import Estimator, Wavelengths, estimator_of, wavelengths
 from rfpose.measurement.wavelengths import CARRIER
 from rfpose.multilat import FixStatus, RangeDifferences
 from rfpose.multilat.ground import CalibrationSight
-from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, Observation, part_of
 from rfpose.multilat.rigid.start import align_points, rotations_from_differences
 from rfpose.pipeline.choice import PoseChoice
 from rfpose.pipeline.formats.result import FixTable
@@ -25,7 +25,7 @@ from rfpose.scenario import Scenario
 IntArray = npt.NDArray[np.int64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "mirror_groups", "mirror_problems"]
+__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "carrier_sigma_rad", "mirror_groups", "mirror_problems"]
 
 _VAGUE_RATIO = 100.0
 """A calibration off by so many times what the pivot is off by tells nothing of the pose."""
@@ -59,7 +59,7 @@ class MirrorGroup:
 
     def knowledge(self, n_frame: int) -> MirrorKnowledge:
         """Return what is known of these mirrors, one row a frame and heliostat."""
-        return self.estimator.knowledge(np.tile(self.pivot_enu_m, (n_frame, 1)))
+        return replace(self.estimator, pivot_enu_m=np.tile(self.pivot_enu_m, (n_frame, 1)))
 
     def of_mirrors(self, values: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
         """Take values (frame, receiver axis, …) apart: (frame × heliostat, receiver, …)."""
@@ -158,9 +158,9 @@ def _problem_of(inputs: RigidInputs, group: MirrorGroup) -> MirrorProblem:
     if inputs.choice.reflection == "none":
         problem = _without_vague_calibration(problem)
     known, weak = problem.knowledge, np.flatnonzero(_are_vague(inputs, group, places))
-    if known.pivot_enu_m is not None and weak.size:
+    if known.pivot_enu_m is not None and np.isfinite(known.pivot_sigma_m) and weak.size:
         pivot[weak] = known.pivot_enu_m[weak]
-        rot[weak] = rotations_from_differences(replace(problem, start_pivot_enu_m=pivot).take(weak))
+        rot[weak] = rotations_from_differences(part_of(replace(problem, start_pivot_enu_m=pivot), mirrors=weak))
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
 
@@ -172,7 +172,7 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
     tones, calibration = inputs.tones, inputs.calibration
     calibrated = inputs.scenario.is_calibrated
     sigma, common = group.range_noise(
-        tones.sigma_rad, tones.carrier_sigma_rad, calibration.sigma_rad if calibrated else None
+        tones.sigma_rad, carrier_sigma_rad(tones), calibration.sigma_rad if calibrated else None
     )
     out = []
     for k, q in enumerate(group.waves.tone):
@@ -198,6 +198,12 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
             )
         )
     return out
+
+
+def carrier_sigma_rad(tones: TonePhases) -> FloatArray:
+    """(frame, receiver, transmitter) standard deviation of the carriers' phases [rad]."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(tones.carrier_sigma / np.abs(tones.carrier))
 
 
 def _coarse(z: FloatArray, difference_m: FloatArray, reference: FloatArray, wavelength: float) -> FloatArray:
@@ -251,7 +257,8 @@ def _either_side(
     sides = []
     for sign in (-1.0, 1.0):
         pivot, rot = align_points(problem.receiver_mirror_m, located + (sign * np.abs(height) - height) * up)
-        sides.append((rows, replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot).take(rows)))
+        begun = replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
+        sides.append((rows, part_of(begun, mirrors=rows)))
     return sides
 
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.measurement import phase_sigma_rad
 from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.mirrors import carrier_sigma_rad
 from rfpose.truth import Truth
 
 __all__ = ["PhaseNoise", "phase_noise"]
@@ -56,7 +57,7 @@ def phase_noise(result: Result, truth: Truth, rows: npt.NDArray[np.int64], *, re
     if truth.tone_snr is None or reported:
         return PhaseNoise(
             tone_rad=tones.sigma_rad,
-            carrier_rad=tones.carrier_sigma_rad,
+            carrier_rad=carrier_sigma_rad(tones),
             calibration_rad=result.calibration.sigma_rad,
             own_m=result.ranges.sigma_m,
             calibration_m=result.ranges.calibration_sigma_m,

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -186,7 +186,24 @@ def process(
                 write_result(result, output)
         if journal is not None:
             job.afterwards(journal.remove)
-        return replace(result, profile=stages.summary())
+        return replace(result, profile=_profile(stages))
+
+
+def _profile(stages: Stopwatch) -> dict[str, Any]:
+    """Return seconds by stage, samples a second of reading and tones, and the stage that takes longest.
+
+    ``read`` and ``tones`` are shared by ``cores``: their seconds are divided by that.
+    """
+    shared = {name: stages.seconds[name] / stages.cores for name in ("read", "tones")}
+    seconds = stages.seconds | shared
+    busy = sum(shared.values())
+    return {
+        "seconds": seconds,
+        "cores": stages.cores,
+        "samples": stages.samples,
+        "samples_per_s": stages.samples / busy if busy > 0.0 else None,
+        "bound_by": max(seconds, key=seconds.__getitem__),
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,7 +251,7 @@ class Asked:
         """
         from rfpose.dsp import ESTIMATORS
         from rfpose.pipeline.choice import choose
-        from rfpose.pipeline.solve import check_solvable
+        from rfpose.pipeline.solvable import check_solvable
 
         if self.estimator not in ESTIMATORS:
             raise InvalidInputError(f"`estimator` must be one of {', '.join(ESTIMATORS)}, got {self.estimator!r}")

@@ -13,22 +13,21 @@ import numpy.typing as npt
 
 from rfpose.checks import read_only
 from rfpose.dsp import CalibrationStatus, PhaseCalibration, TonePhases, calibrate
-from rfpose.errors import GeometryError, ScenarioError
-from rfpose.measurement import check_reflectors
 from rfpose.multilat import (
     Fixes,
     FixStatus,
     Poses,
     RangeDifferences,
     RangeStatus,
-    check_unambiguous,
     range_differences,
     solve_poses,
 )
-from rfpose.multilat.fix import Side, check_transmitters
-from rfpose.pipeline.choice import POSES, PoseChoice, choose
+from rfpose.multilat.fix import Side
+from rfpose.pipeline.choice import PoseChoice
+from rfpose.pipeline.formats.choice_text import settings_of
 from rfpose.pipeline.formats.result import FixTable, PoseTable, Result
 from rfpose.pipeline.rigid import RigidMemory, RigidOutcome, solve_rigid_poses
+from rfpose.pipeline.solvable import check_solvable
 from rfpose.pipeline.stages import Stopwatch
 from rfpose.scenario import Heliostat, Scenario
 from rfpose.truth import Truth
@@ -36,84 +35,13 @@ from rfpose.truth import Truth
 if TYPE_CHECKING:
     from rfpose.pipeline.site import SiteOutcome
 
-__all__ = ["POSES", "check_solvable", "no_calibration", "solve", "solve_calibrated"]
+__all__ = ["no_calibration", "solve", "solve_calibrated"]
 
 _UNSURVEYED_M = 3.0
 """How far a pivot may be from where the scenario has it, if it is not surveyed."""
 
 _SURVEY_SIGMAS = 6.0
 """How many standard deviations a surveyed place may be off."""
-
-
-def check_solvable(scenario: Scenario, *, pose: str, choice: PoseChoice | None = None) -> None:
-    """Refuse a site that no recording could be solved for, before any work is done.
-
-    Parameters
-    ----------
-    scenario
-    pose
-        One of `POSES`.
-    choice
-        The estimator; default: as the scenario says.
-
-    Raises
-    ------
-    InvalidInputError
-        Unknown ``pose``.
-    ScenarioError
-        No heliostat; or no calibration receiver where one is needed: by pose ``independent``, by mirrors whose
-        pivot is not surveyed, and by reflections.
-    GeometryError
-        Too few transmitters, on a line or at the same place; or the field (without calibration receivers: a mirror)
-        is too wide for the longest tone; or something stands behind a plane that is to reflect it.
-    """
-    chosen = choose(scenario, pose=pose) if choice is None else choice
-    if not scenario.heliostat:
-        raise ScenarioError(f"scenario `{scenario.name}` has no heliostat to measure; add a [[heliostat]]")
-    check_transmitters(scenario.transmitter_enu_m)
-    if scenario.is_calibrated:
-        check_unambiguous(scenario.transmitter_enu_m, scenario.wavelength_m)
-    else:
-        _check_solvable_by_differences(scenario, chosen)
-    if chosen.pose == "site":
-        from rfpose.pipeline.site import check_site_solvable
-
-        check_site_solvable(scenario)
-    check_reflectors(scenario, chosen.reflection)
-
-
-def _check_solvable_by_differences(scenario: Scenario, choice: PoseChoice) -> None:
-    """Refuse what cannot do without calibration receivers."""
-    if choice.pose == "site":
-        return
-    if choice.pose != "rigid":
-        raise ScenarioError(
-            f"scenario `{scenario.name}` has no calibration receiver, and pose `{choice.pose}` needs one to learn the "
-            "transmitters' electronic phases; add a [[calibration_receiver]] at a surveyed place, or survey the "
-            "pivots (`pivot_sigma_m`) and use pose `rigid`"
-        )
-    if choice.reflection != "none":
-        raise ScenarioError(
-            f"scenario `{scenario.name}` has no calibration receiver, and reflections cannot be told from what the "
-            "transmitters' phases do without one; add a [[calibration_receiver]] at a surveyed place, or leave "
-            "reflections out (`reflection='ignore'`)"
-        )
-    longest = float(np.max(scenario.wavelength_m))
-    for heliostat in scenario.heliostat:
-        if heliostat.pivot_sigma_m is None:
-            raise ScenarioError(
-                f"scenario `{scenario.name}` has no calibration receiver, and the pivot of heliostat "
-                f"`{heliostat.id}` is not surveyed: nothing tells where it is; add a [[calibration_receiver]] at a "
-                "surveyed place, or give `pivot_sigma_m`"
-            )
-        places = np.array(heliostat.receiver_mirror_m)
-        width = float(np.max(np.linalg.norm(places[:, None] - places, axis=-1)))
-        if width >= longest / 4.0:
-            raise GeometryError(
-                f"ambiguous: receivers of heliostat `{heliostat.id}` are {width:.3g} m apart, and without calibration "
-                f"receivers that must be below a quarter of the longest tone's wavelength of {longest:.6g} m; add a "
-                f"tone of wavelength above {4.0 * width:.6g} m"
-            )
 
 
 def solve(
@@ -148,7 +76,7 @@ def solve(
     Raises
     ------
     InvalidInputError, ScenarioError, GeometryError
-        As `check_solvable`. A receiver or mirror that cannot be solved is NaN with a status.
+        As `rfpose.pipeline.solvable.check_solvable`. A receiver or mirror that cannot be solved is NaN with a status.
     """
     check_solvable(scenario, pose=choice.pose, choice=choice)
     with contextlib.nullcontext() if stages is None else stages.during("calibration"):
@@ -216,7 +144,7 @@ def solve_calibrated(
         scenario=scenario,
         sample_rate=sample_rate,
         choice=choice,
-        settings={**settings, "sample_rate": str(sample_rate), **choice.as_settings()},
+        settings={**settings, "sample_rate": str(sample_rate), **settings_of(choice)},
         frame_start_index=tones.frame_start_index,
         tones=tones,
         calibration=calibration,

@@ -191,7 +191,7 @@ def write_starter(
         A file exists, or cannot be written.
     """
     from rfpose.pipeline.choice import POSES
-    from rfpose.pipeline.solve import check_solvable
+    from rfpose.pipeline.solvable import check_solvable
 
     path = Path(path)
     text = _toml(starter)

@@ -8,7 +8,7 @@ sample of the mirrors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,10 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.measurement import estimator_of, noise_of, simulated_ground, wavelengths_of
-from rfpose.multilat.fix import check_transmitters
 from rfpose.multilat.ground import solve_with_ground
 from rfpose.multilat.ground.model import range_shift_m
-from rfpose.multilat.rigid import MirrorProblem, Observation, rigid_bound
+from rfpose.multilat.rigid import MirrorProblem, Observation, part_of, rigid_bound
+from rfpose.multilat.transmitters import check_transmitters
 from rfpose.scenario import Scenario
 
 __all__ = ["RadioByPosture", "RadioErrors"]
@@ -141,9 +141,9 @@ class RadioByPosture:
             sigma_m=sigma,
             transmitter_sigma_m=self._common_m,
             clock_class=self._waves.clock_class,
-            knowledge=self._estimator.knowledge(pivot),
+            knowledge=replace(self._estimator, pivot_enu_m=pivot),
         )
-        turn = rigid_bound(mirrors.groups(slice(n_tone)))[:, 3:, 3:]
+        turn = rigid_bound(part_of(mirrors, groups=slice(n_tone)))[:, 3:, 3:]
         if sigma.shape[1] == n_tone:
             return turn
         wavelength = self._waves.wavelength_m[-1]
@@ -219,7 +219,7 @@ class RadioByPosture:
             self._observations(pivot, rot),
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,
-            knowledge=self._estimator.knowledge(pivot),
+            knowledge=replace(self._estimator, pivot_enu_m=pivot),
         )
         found = solve_with_ground(
             mirrors,

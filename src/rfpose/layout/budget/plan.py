@@ -175,7 +175,7 @@ class WorkingPoint:
             clock_class=waves.clock_class,
             start_pivot_enu_m=np.tile(self.mirrors.pivot_enu_m, (n_draw, 1)),
             start_rot_enu_from_mirror=np.tile(self.mirrors.rot_enu_from_mirror, (n_draw, 1, 1)),
-            knowledge=self.estimator.knowledge(surveyed_pivot_enu_m.reshape(-1, 3)),
+            knowledge=replace(self.estimator, pivot_enu_m=surveyed_pivot_enu_m.reshape(-1, 3)),
         )
         return replace(problem, wavelength_m=waves.wavelength_m, is_carrier=waves.is_carrier)
 

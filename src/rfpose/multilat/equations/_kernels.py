@@ -203,12 +203,11 @@ def pull_to_prior(prior, m, pivot, rot, clock, gradient):
 
 
 @kernel
-def factor(matrix, floor):
-    """Cholesky of the lower triangle in place; False where it is singular.
+def factor(matrix, n, floor):
+    """Cholesky of the lower triangle of the first ``n`` rows in place; False where it is singular.
 
     ``floor`` is the smallest pivot, relative to the diagonal, that still counts as observed.
     """
-    n = matrix.shape[0]
     for j in range(n):
         diagonal = matrix[j, j]
         d = diagonal

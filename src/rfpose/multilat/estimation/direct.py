@@ -15,7 +15,10 @@ from rfpose.multilat.integrity.guard import solve_with_integrity, widened
 from rfpose.multilat.integrity.records import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
 from rfpose.multilat.normal import MAX_SIGMA_RAD
 from rfpose.multilat.rigid.integers import solve_ladder
-from rfpose.multilat.rigid.pose import MirrorProblem, RigidPoses, solve_rigid
+from rfpose.multilat.rigid.parts import part_of
+from rfpose.multilat.rigid.pose import solve_rigid
+from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.records import RigidPoses
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["PoseEstimates", "are_doubted", "finished", "joined", "protected", "solve_direct"]
@@ -125,8 +128,8 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> PoseEstimates:
     first: GuardedPoses | None = None
     used = problem
     if alarms is not None:
-        first = solve_with_integrity(problem.groups(slice(1)), alarms)
-        used = problem.only(first.used)
+        first = solve_with_integrity(part_of(problem, groups=slice(1)), alarms)
+        used = part_of(problem, used=first.used)
     ladder = solve_ladder(used)
     resolved = replace(used, range_m=ladder.range_m)
     found = PoseEstimates(
@@ -141,7 +144,7 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> PoseEstimates:
     if alarms is None or first is None:
         found.status[(found.status == PoseStatus.OK) & (probability < RESIDUAL_PROBABILITY)] = PoseStatus.RESIDUAL
         return found
-    climbed = resolved.started(ladder.poses.pivot_enu_m, ladder.poses.rot_enu_from_mirror)
+    climbed = part_of(resolved, begin=(ladder.poses.pivot_enu_m, ladder.poses.rot_enu_from_mirror))
     guard = joined(first, solve_with_integrity(climbed, alarms))
     status = guard.poses.status.copy()
     status[(status == PoseStatus.OK) & are_doubted(guard)] = PoseStatus.UNEXPLAINED
@@ -149,7 +152,7 @@ def _solve_from(problem: MirrorProblem, alarms: Alarms | None) -> PoseEstimates:
         found,
         poses=guard.poses,
         status=status,
-        problem=resolved.only(guard.used),
+        problem=part_of(resolved, used=guard.used),
         guard=guard,
         probability_all=_probability_of_all(problem, first, probability),
     )
@@ -160,7 +163,7 @@ def _probability_of_all(problem: MirrorProblem, first: GuardedPoses, probability
     out = probability.copy()
     rows = np.flatnonzero((first.transmitter_status > TransmitterStatus.NOT_RECEIVED).any(axis=1))
     if rows.size:
-        out[rows] = residual_probability(solve_rigid(problem.groups(slice(1)).take(rows)))
+        out[rows] = residual_probability(solve_rigid(part_of(problem, groups=slice(1), mirrors=rows)))
     return out
 
 

@@ -13,7 +13,7 @@ from rfpose.checks import FloatArray
 from rfpose.multilat.estimation.direct import PoseEstimates, are_doubted, finished, joined
 from rfpose.multilat.ground import CalibrationSight, GroundSolution, Reflector, guard_with_ground, solve_with_ground
 from rfpose.multilat.integrity import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus
-from rfpose.multilat.rigid import MirrorProblem, RigidPoses, solve_rigid
+from rfpose.multilat.rigid import MirrorProblem, RigidPoses, part_of, solve_rigid
 from rfpose.multilat.rigid.integers import IntegerMethod
 from rfpose.multilat.status import PoseStatus
 
@@ -84,7 +84,9 @@ def solve_two_ray(
         Rows that have their coefficients in common.
     """
     problem = _better_start(problem, surveyed_enu_m)
-    parts = [_two_ray_of(problem.take(rows), reflections.take(rows), alarms, heliostat[rows]) for rows in shared]
+    parts = [
+        _two_ray_of(part_of(problem, mirrors=rows), reflections.take(rows), alarms, heliostat[rows]) for rows in shared
+    ]
     return finished(_in_order(parts, np.argsort(np.concatenate(shared)), problem), alarms)
 
 
@@ -93,8 +95,9 @@ def _better_start(problem: MirrorProblem, surveyed_enu_m: FloatArray) -> MirrorP
 
     Receivers located each on its own are metres off where the ground reflects.
     """
-    poses = solve_rigid(problem.groups(slice(1)))
-    rot = problem.started(poses.pivot_enu_m, poses.rot_enu_from_mirror).start_rot_enu_from_mirror
+    poses = solve_rigid(part_of(problem, groups=slice(1)))
+    rot = poses.rot_enu_from_mirror
+    rot = np.where(np.isfinite(rot), rot, problem.start_rot_enu_from_mirror)
     pivot = np.where(np.isfinite(rot).all(axis=2), surveyed_enu_m, np.nan)
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=rot)
 
@@ -113,7 +116,8 @@ def _two_ray_of(
         guard = guard_with_ground(solution, alarms)
         if np.any(guard.transmitter_status > TransmitterStatus.NOT_RECEIVED):
             first = guard
-            kept = better.only(first.used).started(first.poses.pivot_enu_m, first.poses.rot_enu_from_mirror)
+            begin = (first.poses.pivot_enu_m, first.poses.rot_enu_from_mirror)
+            kept = part_of(better, used=first.used, begin=begin)
             solution = _solve_ground(kept, reflections)
             guard = joined(first, guard_with_ground(solution, alarms))
     poses = solution.poses if guard is None else guard.poses
@@ -165,7 +169,7 @@ def _again(
     reflectors = tuple(
         replace(r, coefficient=complex(c)) for r, c in zip(reflections.reflectors, solution.coefficient, strict=True)
     )
-    found = _solve_ground(better.take(lost), replace(reflections.take(lost), reflectors=reflectors))
+    found = _solve_ground(part_of(better, mirrors=lost), replace(reflections.take(lost), reflectors=reflectors))
     fits = found.status == PoseStatus.OK
     pivot[lost[fits]], turned[lost[fits]] = found.poses.pivot_enu_m[fits], found.poses.rot_enu_from_mirror[fits]
     return replace(problem, start_pivot_enu_m=pivot, start_rot_enu_from_mirror=turned)

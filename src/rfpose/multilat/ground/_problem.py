@@ -11,7 +11,9 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array
 from rfpose.multilat.equations import MirrorArrays
 from rfpose.multilat.reflection import SharedGeometry, direct_rays, shifts_at_points
-from rfpose.multilat.rigid.pose import FLOOR, FitRule, MirrorProblem, RigidFits, begin, fit, predict
+from rfpose.multilat.rigid.pose import FLOOR, FitRule, RigidFits, begin, fit, predict
+from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.weights import equations_of
 
 __all__ = ["CalibrationSight", "GroundProblem", "build", "follow"]
 
@@ -179,10 +181,10 @@ def build(
 ) -> GroundProblem:
     """Lay out mirrors with their integers resolved."""
     calibration = CalibrationSight.checked(calibration)
-    arrays = mirrors.equations
+    arrays, dof = equations_of(mirrors)
     if calibration.frame is not None:
         arrays = arrays._replace(frame=_rank(calibration.frame))
-    return GroundProblem(scene=scene, mirrors=arrays, calibration=calibration, dof=mirrors.dof)
+    return GroundProblem(scene=scene, mirrors=arrays, calibration=calibration, dof=dof)
 
 
 def _rank(frame: IntArray) -> IntArray:

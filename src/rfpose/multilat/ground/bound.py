@@ -13,7 +13,8 @@ from rfpose.multilat.ground import _coefficients
 from rfpose.multilat.ground._problem import CalibrationSight, build
 from rfpose.multilat.ground.model import SPEED_OF_LIGHT_MPS, Reflector, build_scene
 from rfpose.multilat.ground.solve import joint_covariance
-from rfpose.multilat.rigid.pose import MirrorProblem
+from rfpose.multilat.rigid.pose import can_begin
+from rfpose.multilat.rigid.problem import MirrorProblem
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["ground_bound"]
@@ -71,7 +72,7 @@ def ground_bound(
     state = problem.begin(pivot, rot, np.zeros(n_mirror, np.int64))
     predicted, _ = problem.predict(state, parameter)
     problem = replace(problem, mirrors=still._replace(z=predicted))
-    state.status[~mirrors.has_start] = PoseStatus.TOO_FEW
+    state.status[~can_begin(mirrors)] = PoseStatus.TOO_FEW
     problem.fit(state, parameter)
     solved = state.status == 0
     information = _coefficients.information(state, solved)

@@ -16,7 +16,8 @@ from rfpose.multilat.ground._problem import GroundProblem
 from rfpose.multilat.ground.solve import GroundSolution, turns
 from rfpose.multilat.integrity.guard import Guard
 from rfpose.multilat.integrity.records import Alarms, GuardedPoses, TransmitterStatus, Verdict
-from rfpose.multilat.rigid.pose import PRIORS, RigidFits
+from rfpose.multilat.rigid.pose import RigidFits
+from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.multilat.status import PoseStatus, has_start
 
 __all__ = ["guard_with_ground"]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.multilat.rigid.integers import common_offset
-from rfpose.multilat.rigid.pose import MirrorProblem
+from rfpose.multilat.rigid.problem import MirrorProblem
 
 __all__ = ["resolve"]
 

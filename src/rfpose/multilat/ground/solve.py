@@ -27,7 +27,10 @@ from rfpose.multilat.ground.model import (
     build_scene,
     heights_m,
 )
-from rfpose.multilat.rigid.pose import MirrorProblem, Observation, RigidFits, RigidPoses
+from rfpose.multilat.rigid.parts import part_of
+from rfpose.multilat.rigid.pose import RigidFits, can_begin
+from rfpose.multilat.rigid.problem import MirrorProblem, Observation
+from rfpose.multilat.rigid.records import RigidPoses
 from rfpose.multilat.status import PoseStatus, has_start
 
 __all__ = ["GroundSolution", "joint_covariance", "solve_with_ground", "turns"]
@@ -129,13 +132,13 @@ def solve_with_ground(
     GeometryError
         A transmitter behind a reflector.
     """
-    n_tone = mirrors.n_tone
+    n_tone = int(np.count_nonzero(~mirrors.is_carrier))
     observations = [mirrors.observation(k) for k in range(len(mirrors.clock_class))]
     transmitter, places, n_mirror = mirrors.transmitter_enu_m, mirrors.receiver_mirror_m, len(mirrors.range_m)
     pivot, rot = mirrors.start_pivot_enu_m, mirrors.start_rot_enu_from_mirror
     status = np.zeros(n_mirror, np.int64)
     status[_behind(places, pivot, rot, reflectors)] = PoseStatus.BEHIND_REFLECTOR
-    status[~mirrors.has_start] = PoseStatus.TOO_FEW
+    status[~can_begin(mirrors)] = PoseStatus.TOO_FEW
     speed = as_positive("propagation_speed_mps", propagation_speed_mps)
     scene = build_scene(
         transmitter,
@@ -150,7 +153,7 @@ def solve_with_ground(
         count = len(ranges)
         used = scene._replace(tone_k=scene.tone_k[:count], common=scene.common[:, :, :count].copy())
         begun = replace(
-            mirrors.groups(slice(count)),
+            part_of(mirrors, groups=slice(count)),
             range_m=np.stack(ranges, axis=1),
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,

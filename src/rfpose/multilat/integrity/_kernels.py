@@ -180,7 +180,7 @@ def _judge_one(scene, mirrors, m, floor, pivot, rot, clock, data_info, data_grad
             data_info[b, a] = data_info[a, b]
     lower = data_info.copy()
     add_prior(mirrors.prior, m, rot, lower, 0, 6)
-    if not factor(lower, 1e-13):
+    if not factor(lower, lower.shape[0], 1e-13):
         return False
     covariance(lower, cov)
     rows = np.empty((n_transmitter, k, n))

@@ -16,7 +16,11 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.multilat.equations import MirrorArrays
 from rfpose.multilat.integrity.hypotheses import judge
 from rfpose.multilat.integrity.records import Alarms, GuardedPoses, IntegrityStatus, TransmitterStatus, Verdict
-from rfpose.multilat.rigid.pose import PRIORS, MirrorProblem, RigidPoses, solve_rigid
+from rfpose.multilat.rigid.parts import part_of
+from rfpose.multilat.rigid.pose import can_begin, solve_rigid
+from rfpose.multilat.rigid.problem import PRIORS, MirrorProblem
+from rfpose.multilat.rigid.records import RigidPoses
+from rfpose.multilat.rigid.weights import equations_of, used_priors
 from rfpose.multilat.status import PoseStatus
 
 __all__ = ["Guard", "limit", "log_probability", "noncentrality", "solve_with_integrity", "widened"]
@@ -249,11 +253,12 @@ class _DirectGuard(Guard):
 
     def __init__(self, given: MirrorProblem, alarms: Alarms) -> None:
         n_mirror, _, n_receiver, n_transmitter = given.range_m.shape
-        poses = solve_rigid(given)
-        super().__init__(poses, given.equations, alarms, n_transmitter * (1 + n_receiver) + len(PRIORS))
+        equations = equations_of(given)
+        poses = solve_rigid(given, equations)
+        super().__init__(poses, equations.mirrors, alarms, n_transmitter * (1 + n_receiver) + len(PRIORS))
         self.given = given
         # mirrors that only something left out may let converge
-        self.lost = np.flatnonzero((poses.status == PoseStatus.NOT_CONVERGED) & given.has_start)
+        self.lost = np.flatnonzero((poses.status == PoseStatus.NOT_CONVERGED) & can_begin(given))
         # what was left out, in order: mirrors, hypothesis
         self.history: list[tuple[IntArray, IntArray]] = []
         # other explanations of what was found: normal and its uncertainty if that had been left out instead
@@ -264,14 +269,14 @@ class _DirectGuard(Guard):
     # -- solving
 
     def _problem(self, rows: IntArray, weight: FloatArray, dropped: BoolArray) -> MirrorProblem:
-        some = self.given.take(rows)
+        some = part_of(self.given, mirrors=rows)
         return replace(some, range_m=np.where(weight > 0.0, some.range_m, np.nan), dropped=dropped)
 
     def _solve(self, rows: IntArray, weight: FloatArray, dropped: BoolArray, *, from_start: bool = False) -> Arrays:
         """Solve some mirrors with other weights and priors, from where they are or from their first start."""
         some = self._problem(rows, weight, dropped)
         if not from_start:
-            some = some.started(self.poses["pivot_enu_m"][rows], self.poses["rot_enu_from_mirror"][rows])
+            some = part_of(some, begin=(self.poses["pivot_enu_m"][rows], self.poses["rot_enu_from_mirror"][rows]))
         poses = solve_rigid(some)
         return {name: getattr(poses, name) for name in self.poses}
 
@@ -301,7 +306,7 @@ class _DirectGuard(Guard):
         if not rows.size:
             return rows
         before, dropped_before = self.weight[rows].copy(), self.dropped[rows].copy()
-        has_prior = self._problem(rows, before, dropped_before).has_prior
+        has_prior = used_priors(self._problem(rows, before, dropped_before))
         used = np.concatenate([(before > 0.0).any(axis=(1, 2)), has_prior], axis=1)
         best, choice = np.full(len(rows), np.inf), np.full(len(rows), -1)
         for h in range(used.shape[1]):

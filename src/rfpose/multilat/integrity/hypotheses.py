@@ -15,7 +15,8 @@ from rfpose.multilat.integrity import _kernels
 from rfpose.multilat.integrity.records import Verdict
 from rfpose.multilat.reflection import direct_rays
 from rfpose.multilat.rigid import MirrorProblem, RigidPoses
-from rfpose.multilat.rigid.pose import PRIORS
+from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.multilat.rigid.weights import used_priors, weighed
 
 __all__ = ["judge"]
 
@@ -25,14 +26,14 @@ BoolArray = npt.NDArray[np.bool_]
 _FLOOR = 1e-8
 """Redundancy below which a fault counts as invisible."""
 _TIE_FLOOR = 1e-6
-"""As `rfpose.multilat.rigid.pose.STIFFEST_TIE`, so that freeing a tie stands out of its rounding."""
+"""As `rfpose.multilat.rigid.weights.STIFFEST_TIE`, so that freeing a tie stands out of its rounding."""
 
 
 def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
     """Test every hypothesis at the least-squares poses."""
-    mirrors = problem.weighed(_TIE_FLOOR)
+    mirrors = weighed(problem, _TIE_FLOOR)
     n_mirror, n_group, n_receiver, n_transmitter = mirrors.z.shape
-    n_hypothesis, n = n_transmitter + len(PRIORS), 6 + problem.n_class * n_receiver
+    n_hypothesis, n = n_transmitter + len(PRIORS), 6 + mirrors.prior.clock.shape[1] * n_receiver
     solved = _kernels.SolvedMirrors(
         ok=np.zeros(n_mirror, np.bool_),
         data_info=np.zeros((n_mirror, n, n)),
@@ -56,7 +57,7 @@ def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
     _kernels.judge_many(n_mirror, scene, mirrors, _FLOOR, pivot, rot, clock, solved, tests)
     axes = rot[:, :, :2]
     cov_tilt = np.einsum("mac,mab,mbd->mcd", axes, solved.cov[:, 3:6, 3:6], axes)
-    for k, (used, fault) in enumerate(zip(problem.has_prior.T, _prior_faults(problem, rot), strict=True)):
+    for k, (used, fault) in enumerate(zip(used_priors(problem).T, _prior_faults(problem, rot), strict=True)):
         rows = np.flatnonzero(used & solved.ok)
         if rows.size:
             _free_prior(solved, tests, rows, n_transmitter + k, axes[rows], cov_tilt[rows], fault[rows])
@@ -72,7 +73,7 @@ def judge(problem: MirrorProblem, poses: RigidPoses) -> Verdict:
 def _prior_faults(problem: MirrorProblem, rot: FloatArray) -> list[FloatArray]:
     """Unknowns (mirror, unknown, fault) that each of `PRIORS` would leave free."""
     n_mirror, _, n_receiver, _ = problem.range_m.shape
-    n_class = problem.n_class
+    n_class = int(problem.clock_class.max()) + 1
     eye = np.eye(6 + n_class * n_receiver)
     mount = np.zeros((n_mirror, len(eye), 1))
     mount[:, 3, 0], mount[:, 4, 0] = rot[:, 1, 0], -rot[:, 0, 0]

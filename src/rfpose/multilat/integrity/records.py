@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid.pose import PRIORS, RigidPoses
+from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.multilat.rigid.records import RigidPoses
 
 __all__ = ["Alarms", "GuardedPoses", "IntegrityStatus", "TransmitterStatus", "Verdict"]
 
@@ -120,7 +121,7 @@ class GuardedPoses:
     used : (mirror, receiver, transmitter)
         Which were used in the end.
     prior_rejected : (mirror, prior)
-        Which of `rfpose.multilat.rigid.pose.PRIORS` (pivot, mount, clocks) contradicts the data and was left out.
+        Which of `rfpose.multilat.rigid.problem.PRIORS` (pivot, mount, clocks) contradicts the data and was left out.
     prior_testable : (mirror, prior)
         Whether the data could contradict it at all.
     chi2_probability : (mirror,)

@@ -1,24 +1,20 @@
 """Poses of rigid mirrors from all phases of their receivers at once."""
 
+from rfpose.multilat.rigid.parts import part_of
 from rfpose.multilat.rigid.places import ReceiverPlaces, places_bound, refine_places
-from rfpose.multilat.rigid.pose import (
-    MirrorKnowledge,
-    MirrorProblem,
-    Observation,
-    RigidPoses,
-    full_covariance,
-    rigid_bound,
-    solve_rigid,
-    tilt_sigma_rad,
-)
+from rfpose.multilat.rigid.pose import full_covariance, rigid_bound, solve_rigid
+from rfpose.multilat.rigid.problem import PRIORS, MirrorKnowledge, MirrorProblem, Observation
+from rfpose.multilat.rigid.records import RigidPoses, tilt_sigma_rad
 
 __all__ = [
+    "PRIORS",
     "MirrorKnowledge",
     "MirrorProblem",
     "Observation",
     "ReceiverPlaces",
     "RigidPoses",
     "full_covariance",
+    "part_of",
     "places_bound",
     "refine_places",
     "rigid_bound",

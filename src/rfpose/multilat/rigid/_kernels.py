@@ -238,7 +238,7 @@ def _fit(scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest):
         for a in range(n_own):
             for b in range(a + 1):
                 lower[a, b] = info[a, b]
-        if not factor(lower, rule.floor):
+        if not factor(lower, n_own, rule.floor):
             return chi2, used, OPEN
         for a in range(n_own):
             step[a] = gradient[a]
@@ -378,7 +378,7 @@ def covariance_many(begin, end, scene, mirrors, floor, pivot, rot, clock, cov):
             info, unused,
         )  # fmt: skip
         add_prior(mirrors.prior, m, rot[m], info, 0, 6)
-        if factor(info, floor):
+        if factor(info, info.shape[0], floor):
             covariance(info, cov[m])
 
 

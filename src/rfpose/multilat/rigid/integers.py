@@ -16,7 +16,10 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError
-from rfpose.multilat.rigid.pose import MirrorProblem, RigidPoses, solve_rigid
+from rfpose.multilat.rigid.parts import part_of
+from rfpose.multilat.rigid.pose import solve_rigid
+from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.records import RigidPoses
 from rfpose.multilat.rigid.search import (
     DELAY_REACH_M,
     Candidates,
@@ -172,10 +175,11 @@ class _Ladder:
         rows = np.repeat(mirrors, repeat)
         shape = (len(mirrors), repeat, *ranges[0].shape[2:])
         z = np.stack([np.broadcast_to(r, shape).reshape(-1, *shape[2:]) for r in ranges], axis=1)
-        some = replace(self.problem.groups(slice(len(ranges))).take(rows), range_m=z)
+        begin = None
         if isinstance(start, RigidPoses):
-            some = some.started(start.pivot_enu_m[rows], start.rot_enu_from_mirror[rows])
-        return solve_rigid(some)
+            begin = start.pivot_enu_m[rows], start.rot_enu_from_mirror[rows]
+        some = part_of(self.problem, groups=slice(len(ranges)), mirrors=rows, begin=begin)
+        return solve_rigid(replace(some, range_m=z))
 
     def climb(self, k: int, poses: RigidPoses, *, search: bool) -> RigidPoses:
         """Resolve observation k where that is safe, and solve with it."""
@@ -211,7 +215,7 @@ class _Ladder:
     def _search(self, k: int, mirrors: IntArray, poses: RigidPoses, prediction: PredictedRanges) -> None:
         """Resolve by least squares what could not be rounded."""
         for part in np.array_split(mirrors, -(-len(mirrors) // _SEARCH_ROWS)):
-            found = search_integers(self.problem.take(part), k, prediction.take(part))
+            found = search_integers(part_of(self.problem, mirrors=part), k, prediction.take(part))
             risk, odds = found.wrong_risk.copy(), found.odds_against.copy()
             chosen = np.zeros(len(part), np.int64)
             method = np.full(len(part), IntegerMethod.LEAST_SQUARES, np.int64)

@@ -17,7 +17,10 @@ from rfpose.checks import FloatArray, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.multilat.equations import rotate
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.pose import MirrorProblem
+from rfpose.multilat.rigid.parts import part_of
+from rfpose.multilat.rigid.pose import can_begin
+from rfpose.multilat.rigid.problem import MirrorProblem
+from rfpose.multilat.rigid.weights import MirrorEquations, equations_of, used_priors
 
 __all__ = ["ReceiverPlaces", "places_bound", "refine_places"]
 
@@ -121,6 +124,7 @@ def places_bound(problem: MirrorProblem, *, common_pivot: bool = True) -> Receiv
     state = _State.begin(problem, common_pivot)
     distance, _ = state.ranges()
     state.problem = replace(state.problem, range_m=np.where(np.isfinite(problem.range_m), distance[:, None], np.nan))
+    state.weighed = equations_of(state.problem)
     state.clock[:] = 0.0
     return state.result(True)
 
@@ -130,6 +134,7 @@ class _State:
     """Places, poses and clocks as they are now."""
 
     problem: MirrorProblem
+    weighed: MirrorEquations
     surveyed: bool
     common_pivot: bool
     places: FloatArray
@@ -141,7 +146,7 @@ class _State:
     def begin(cls, problem: MirrorProblem, common_pivot: bool) -> _State:
         if not len(problem.range_m):
             raise InvalidInputError("`range_m` must hold at least one posture")
-        if not problem.has_start.all():
+        if not can_begin(problem).all():
             raise InvalidInputError("every posture must have a pose to begin with")
         pivot, rot = problem.start_pivot_enu_m.copy(), problem.start_rot_enu_from_mirror.copy()
         if common_pivot:
@@ -149,16 +154,18 @@ class _State:
         # surveys of the pivot count once for all postures
         dropped = problem.dropped.copy()
         dropped[:, 0] = True
-        surveyed = bool(problem.has_prior[0, 0])
-        problem = replace(problem.started(pivot, rot), dropped=dropped)
+        surveyed = bool(used_priors(problem)[0, 0])
+        problem = replace(part_of(problem, begin=(pivot, rot)), dropped=dropped)
+        weighed = equations_of(problem)
         return cls(
             problem=problem,
+            weighed=weighed,
             surveyed=surveyed,
             common_pivot=common_pivot,
             places=problem.receiver_mirror_m[0].copy(),
             pivot=pivot,
             rot=rot,
-            clock=problem.equations.prior.clock.copy(),
+            clock=weighed.mirrors.prior.clock.copy(),
         )
 
     def ranges(self) -> tuple[FloatArray, FloatArray]:
@@ -170,7 +177,7 @@ class _State:
 
     def equations(self) -> tuple[FloatArray, FloatArray, float]:
         """Return the normal equations of each posture: [pivot, rotation, clocks, places], and chi²."""
-        mirrors = self.problem.equations
+        mirrors = self.weighed.mirrors
         n_f, _, n_r, n_t = mirrors.z.shape
         n = 6 + self.clock[0].size + 3 * n_r
         distance, unit = self.ranges()
@@ -241,7 +248,7 @@ class _State:
         seen = value > _UNSEEN * value[-1]
         unseen = vector[:, ~seen].T
         # a posture's own unknowns are counted with it; what all share, here
-        dof = float(self.problem.dof.sum() - int(seen.sum()))
+        dof = float(self.weighed.dof.sum() - int(seen.sum()))
         if self.common_pivot:
             dof += 3 * len(self.pivot) - 3 + 3 * self.surveyed
         names, modes = _name(unseen, self.places)

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.multilat.ambiguity import integer_least_squares
 from rfpose.multilat.rigid import _kernels
-from rfpose.multilat.rigid.pose import MirrorKnowledge, MirrorProblem, RigidPoses
+from rfpose.multilat.rigid.problem import MirrorKnowledge, MirrorProblem
+from rfpose.multilat.rigid.records import RigidPoses
 
 __all__ = ["Candidates", "PredictedRanges", "can_search", "predict", "search_integers"]
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray, as_float_array
-from rfpose.multilat.rigid.pose import MirrorProblem
+from rfpose.multilat.rigid.problem import MirrorProblem
 
 __all__ = ["align_points", "rotations_from_differences"]
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
+from rfpose.multilat.equations._kernels import factor
 
 _MAX_STEP_RAD = 0.05
 _SETTLED_SIGMAS = 2e-2
@@ -125,25 +126,6 @@ def turn_between(rot_to, rot_from, out):
     if sine > 1e-9:
         cosine = 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)
         out *= np.arctan2(sine, cosine) / sine
-
-
-@kernel
-def cholesky(a, n):
-    """Replace the lower triangle of a by its Cholesky factor; false where it is not positive definite."""
-    for j in range(n):
-        s = a[j, j]
-        for k in range(j):
-            s -= a[j, k] * a[j, k]
-        if not s > 0.0:
-            return False
-        d = np.sqrt(s)
-        a[j, j] = d
-        for i in range(j + 1, n):
-            s = a[i, j]
-            for k in range(j):
-                s -= a[i, k] * a[j, k]
-            a[i, j] = s / d
-    return True
 
 
 @kernel
@@ -283,7 +265,7 @@ def whitened_rows(
     add_factor_errors(begin, end, heard, part, h, row_of, share, touched, s)
     add_soil_errors(begin, end, heard, part, h, row_of, share, n, s)
     lower[:n, :n] = s[:n, :n]
-    if not cholesky(lower, n):
+    if not factor(lower, n, 0.0):
         return False
     forward(lower, n, a, n_par + 1)
     return True
@@ -524,7 +506,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
             square(a, n, n_par, normal, gradient)
             add_priors(prior, m, pivot, rot, n_tx, n_clock, off, normal, gradient)
             normal_lower[:] = normal
-            if not cholesky(normal_lower, n_par):
+            if not factor(normal_lower, n_par, 0.0):
                 failed = True
                 break
             forward(normal_lower, n_par, gradient, 1)
@@ -644,7 +626,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
         square(a, n, n_par, normal, gradient)
         add_priors(prior, m, pivot, rot, n_tx, n_clock, off, normal, gradient)
         normal_lower[:] = normal
-        cholesky(normal_lower, n_par)
+        factor(normal_lower, n_par, 0.0)
         for p in range(6):
             gradient[:, 0] = 0.0
             gradient[p, 0] = 1.0
@@ -657,7 +639,7 @@ def fit_mirrors(begin_row, end_row, rows, seen_links, heard, prior, law, out, n_
             for q in range(6):
                 out.cov[m, q, p] = gradient[q, 0]
         cov[:] = out.cov[m]
-        cholesky(cov, 6)
+        factor(cov, 6, 0.0)
         forward(cov, 6, last, 1)
         length = 0.0
         for q in range(6):

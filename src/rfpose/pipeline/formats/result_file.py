@@ -22,8 +22,8 @@ from rfpose.kinds import kind_of
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus, RangeDifferences, RangeStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.multilat.rigid.pose import PRIORS
-from rfpose.pipeline.choice import PoseChoice
+from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.pipeline.formats.choice_text import choice_of
 from rfpose.pipeline.formats.columns import (
     ENU,
     FIXED,
@@ -331,7 +331,7 @@ def result_of(
     return Result(
         scenario=scenario,
         sample_rate=rate_of(settings),
-        choice=PoseChoice.of(settings, scenario),
+        choice=choice_of(settings, scenario),
         settings=settings,
         frame_start_index=columns["frames/start_index"],
         tones=TonePhases(
@@ -382,7 +382,7 @@ class _Reader(FileReader):
             if name not in found:
                 raise self.error("settings", f"is missing or lacks `{name}`")
         try:
-            PoseChoice.of(found, scenario)
+            choice_of(found, scenario)
             return found, rate_of(found)
         except RfposeError as error:
             raise self.error("settings", f"cannot be: {error}") from error

@@ -16,7 +16,8 @@ from rfpose.dsp import LineStatus
 from rfpose.multilat import FilterStatus, FixStatus, PoseStatus
 from rfpose.multilat.integrity import IntegrityStatus, TransmitterStatus
 from rfpose.multilat.rigid.integers import IntegerMethod
-from rfpose.multilat.rigid.pose import PRIORS
+from rfpose.multilat.rigid.problem import PRIORS
+from rfpose.pipeline.formats.choice_text import settings_of
 from rfpose.pipeline.formats.result import (
     DelayTable,
     FilteredTable,
@@ -75,7 +76,7 @@ def summarise(result: Result) -> dict[str, Any]:
     for name, (status, codes) in parts.items():
         solved = int(np.count_nonzero(status == 0))
         summary[name] = {"solved": solved, "failed": status.size - solved, "reasons": count_reasons(status, codes)}
-    choice = {"delays": "as the scenario says", **result.settings, **result.choice.as_settings()}
+    choice = {"delays": "as the scenario says", **result.settings, **settings_of(result.choice)}
     summary["choice"] = {name: choice[name] for name in ("reflection", "integrity", "delays", "filter")}
     if result.choice.pose == "rigid":
         summary["integers"] = _summary_of_integers(result)

@@ -15,7 +15,7 @@ from rfpose.errors import RfposeError
 from rfpose.geometry import rot_enu_from_mirror, unit
 from rfpose.multilat import FixStatus, PoseStatus, RangeStatus
 from rfpose.multilat.integrity import TransmitterStatus
-from rfpose.multilat.rigid.pose import PRIORS
+from rfpose.multilat.rigid.problem import PRIORS
 from rfpose.pipeline.evaluate import evaluate
 from rfpose.pipeline.formats.result import Result, frame_time
 from rfpose.scenario import Scenario

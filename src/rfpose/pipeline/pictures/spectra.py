@@ -459,7 +459,8 @@ def phase_track(
             if name not in recording.receiver_ids:
                 continue
             found = _measured(extractor, recording, name, int(start), n_sample, clock.get(row))
-            tones.put(f, row, found)
+            for field in FrameTones.__dataclass_fields__:
+                getattr(tones, field)[f, row] = getattr(found, field)
             clock[row] = found.clock_ppm
         if on_progress is not None:
             on_progress(f + 1, len(starts))
