@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +30,36 @@ from rfpose.recording.segments import open_growing
 from rfpose.scenario import Scenario
 
 N_FRAME = 6
+N_RECEIVER = 7
+
+# Runs the command line; something happens in this process when it measures a given row, or before it keeps a frame.
+DRIVER = """
+import itertools, os, resource, signal, sys
+import rfpose.pipeline.formats.journal as journal
+import rfpose.pipeline.measure as measure
+from rfpose.cli import main
+def killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+def disk_full():
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+at_row, at_frame, what = int(sys.argv[1]), int(sys.argv[2]), globals()[sys.argv[3]]
+del sys.argv[1:4]
+def counted(plain, at, calls):
+    def call(*given, **settings):
+        if next(calls) == at:
+            what()
+        return plain(*given, **settings)
+    return call
+measure.ToneExtractor.measure = counted(measure.ToneExtractor.measure, at_row, itertools.count())
+journal.Journal.append = counted(journal.Journal.append, at_frame, itertools.count())
+main()
+"""
+
+
+def _follow(night: Path, output: Path, what: str, *, at_row: int = -1, at_frame: int = -1) -> Any:
+    words = ["process", str(night), "-o", str(output), "--follow", "--idle-timeout", "0.2"]
+    command = [sys.executable, "-c", DRIVER, str(at_row), str(at_frame), what, *words]
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +179,52 @@ def test_an_interrupted_one_goes_on_and_another_recording_is_refused(night: Path
     found, wanted = rf.open_result(output), rf.open_result(night.parent / "plain.h5")
     np.testing.assert_array_equal(found.tones.phase_rad, wanted.tones.phase_rad)
     np.testing.assert_array_equal(found.poses.normal_enu, wanted.poses.normal_enu)
+
+
+def test_killed_in_a_frame_and_while_it_keeps_one_it_goes_on_to_the_same_bytes(
+    night: Path, plain: bytes, tmp_path: Path
+) -> None:
+    output = tmp_path / "result.h5"
+    assert _follow(night, output, "killed", at_row=N_RECEIVER + 3).returncode == -signal.SIGKILL
+    assert len(rf.open_result(partial_of(output)).frame_start_index) == 1
+    # of the second run the third frame to be kept is the recording's fourth
+    assert _follow(night, output, "killed", at_frame=2).returncode == -signal.SIGKILL
+    assert len(rf.open_result(partial_of(output)).frame_start_index) == 3
+    more: list[Result] = []
+    rf.process(Follow(night, idle_timeout_s=0.2, on_frame=more.append), output)
+    assert len(more) == N_FRAME - 3
+    assert output.read_bytes() == plain
+    assert [path.name for path in tmp_path.iterdir()] == ["result.h5"]
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_frames_before(night: Path, plain: bytes, tmp_path: Path) -> None:
+    output = tmp_path / "result.h5"
+    done = _follow(night, output, "disk_full", at_row=2 * N_RECEIVER + 1)
+    assert done.returncode == 3
+    told = [line for line in done.stderr.splitlines() if "poses solved" not in line]  # of the frames before
+    assert len(told) == 1
+    assert "cannot write: File too large" in told[0]
+    assert len(rf.open_result(partial_of(output)).frame_start_index) == 2
+    rf.process(Follow(night, idle_timeout_s=0.2), output)
+    assert output.read_bytes() == plain
+
+
+def test_a_recording_is_written_live_by_the_command(site: Scenario, night: Path, plain: bytes, tmp_path: Path) -> None:
+    site.save(tmp_path / "site.toml")
+    written = tmp_path / "night"
+    words = ["simulate", str(tmp_path / "site.toml"), "-o", str(written), "--seed", "3", "--live", "--pace", "100"]
+    done = CliRunner().invoke(app, [*words, "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert (told["recording"], told["frames"]) == (str(written), N_FRAME)
+    assert told["bytes"] == sum(file.stat().st_size for file in written.iterdir())
+    assert {file.name: file.read_bytes() for file in written.iterdir()} == {
+        file.name: file.read_bytes() for file in night.iterdir()
+    }
+    rf.process(Follow(written, idle_timeout_s=0.2), tmp_path / "r.h5")
+    assert (tmp_path / "r.h5").read_bytes() == plain
+    again = CliRunner().invoke(app, words)
+    assert (again.exit_code, "frame-000000.h5" in again.stderr) == (3, True)
 
 
 def test_what_is_damaged_late_or_goes_back_is_left_out_and_told(

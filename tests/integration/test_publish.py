@@ -24,6 +24,8 @@ import rfpose as rf
 from rfpose.cli._app import app
 from rfpose.errors import InvalidInputError, PublishError
 from rfpose.multilat import PoseStatus
+from rfpose.pipeline.formats.journal import partial_of
+from rfpose.pipeline.formats.live_result import LiveResult
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import columns_of, result_of
 from rfpose.pipeline.publish import SCHEMA, Broker, PlantServer, messages, send, serving
@@ -231,6 +233,48 @@ def test_a_broker_that_is_gone_and_back_misses_nothing_within_the_buffer(result:
     assert (sent.acknowledged, sent.dropped, sent.unacknowledged) == (len(told) + 1, 0, 0)
     assert sent.reconnections == 1
     assert {m["frame"] for topic, m, _ in listener.heard if "/pose/" in topic} == set(range(len(told)))
+
+
+@needs_broker
+def test_who_follows_a_result_loses_nothing_while_the_broker_is_restarted(
+    result: Result, broker: _Mosquitto, tmp_path: Path
+) -> None:
+    output = tmp_path / "r.h5"
+    listener = _Listener(broker.port)
+    live = LiveResult(partial_of(output), result.scenario, result.settings, probe="", restart=False)
+
+    def solve() -> None:
+        live.append(_frame(result, 0))
+        listener.wait_for(3)  # the schema and two mirrors
+        broker.stop()
+        live.append(_frame(result, 1))
+        time.sleep(0.5)  # it is seen and cannot be sent
+        broker.start()
+        live.append(_frame(result, 2))
+        result.save(output)
+        live.remove()
+
+    solving = threading.Thread(target=solve)
+    solving.start()
+    words = ["publish", str(output), "--follow", "--mqtt", f"mqtt://127.0.0.1:{broker.port}", "--json"]
+    done = CliRunner().invoke(app, words)
+    solving.join()
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert [told[name] for name in ("acknowledged", "dropped", "unacknowledged", "reconnections")] == [7, 0, 0, 1]
+    listener.wait_for(7)
+    listener.close()
+    heard = {(m["frame"], m["heliostat"]) for topic, m, _ in listener.heard if "/pose/" in topic}
+    assert heard == {(frame, name) for frame in range(3) for name in ("H01", "H02")}
+
+
+def _frame(result: Result, i: int) -> Result:
+    columns = {
+        path: values[i : i + 1] if column.dims[0] == "frame" else values
+        for path, (column, values) in columns_of(result).items()
+        if not path.startswith("truth/")
+    }
+    return result_of(result.scenario, result.settings, columns)
 
 
 @needs_broker
