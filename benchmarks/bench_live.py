@@ -20,13 +20,18 @@ import tempfile
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rfpose as rf
+from rfpose.pipeline import follow
 from rfpose.pipeline.follow import Follow
+from rfpose.pipeline.formats.live_result import LiveResult
 from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.measure import FrameByFrame
 from rfpose.recording import Recording, RecordingWriter
+from rfpose.recording.segments import SegmentsRecording
 from rfpose.scenario import Scenario
 
 DAY_S = 86_400
@@ -79,6 +84,36 @@ def record(
         told.send((at, took_s, meanwhile_s))
 
 
+class Stages:
+    """What the last call of each stage took: wall and processor time of both cores [s]."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, tuple[float, float]] = {}
+        self.frames: list[dict[str, tuple[float, float]]] = []
+        self._watch(SegmentsRecording, "refresh", "a file is found and opened")
+        self._watch(FrameByFrame, "measure", "samples are read and measured")
+        self._watch(follow, "solve_calibrated", "poses")
+        self._watch(LiveResult, "append", "poses are kept")
+
+    def _watch(self, owner: Any, name: str, stage: str) -> None:
+        plain = getattr(owner, name)
+
+        def watched(*given: Any, **settings: Any) -> Any:
+            began = time.perf_counter(), time.process_time()
+            try:
+                return plain(*given, **settings)
+            finally:
+                self.last[stage] = time.perf_counter() - began[0], time.process_time() - began[1]
+
+        setattr(owner, name, watched)
+
+    def show(self) -> None:
+        """Print the median of each over frames but the first."""
+        for stage in self.last:
+            wall_s, cpu_s = np.median([frame[stage] for frame in self.frames[1:]], axis=0)
+            print(f"  {stage}: {1e3 * wall_s:.1f} ms, processor time {1e3 * cpu_s:.1f} ms")
+
+
 def memory_mb() -> float:
     """Return the resident memory of this process [MB]."""
     text = Path("/proc/self/statm").read_text()
@@ -110,6 +145,7 @@ def main() -> None:
     writing_s: list[float] = []
     recorder_s: list[float] = []
     spent_s: list[float] = []
+    stages = Stages()
 
     def on_frame(_result: Result) -> None:
         seen = time.time()
@@ -117,6 +153,7 @@ def main() -> None:
         latency_s.append(seen - at)
         writing_s.append(took)
         recorder_s.append(meanwhile)
+        stages.frames.append(dict(stages.last))
         memory.append(memory_mb())
         spent_s.append(time.process_time())
         if len(latency_s) < asked.frames:
@@ -154,6 +191,7 @@ def main() -> None:
     )
     print(f"the recorder's processor time while a frame is solved: at most {1e3 * max(recorder_s):.0f} ms")
     print(f"processor time a frame, both cores together: median {1e3 * np.median(np.diff(spent_s)):.0f} ms")
+    stages.show()
     for k, (times, sizes) in enumerate(zip(np.array_split(later, 10), np.array_split(memory[1:], 10), strict=True)):
         if asked.day:
             print(f"  tenth {k + 1:2d}: latency median {1e3 * np.median(times):5.1f} ms, memory {sizes[-1]:.0f} MB")

@@ -1,4 +1,4 @@
-"""Pictures of the viewer and of a report for docs/viewer.md, drawn without a screen: viewer_*.png and report.png.
+"""Pictures of the viewer and of a report, drawn without a screen: viewer_*.png and report.png of docs/images.
 
     .venv/bin/python scripts/screenshots.py [--output DIRECTORY]
 
@@ -8,6 +8,7 @@ Each view at 1280 × 800 in the light theme, two in the dark one, and one at a s
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import subprocess
@@ -21,6 +22,8 @@ import numpy as np
 
 from rfpose.layout.fields import radial_staggered
 from rfpose.pipeline.demo import shipped_scenario
+from rfpose.pipeline.follow import Follow
+from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.process import process
 from rfpose.pipeline.report import report_html
 from rfpose.pipeline.simulate import simulate
@@ -120,6 +123,34 @@ def live(path: Path, output: Path) -> None:
     print(output)
 
 
+class _EnoughError(Exception):
+    """So many frames are shown."""
+
+
+def following(path: Path, output: Path) -> None:
+    """Write a picture of a result that is being made: seven frames of ten are solved, the last one is shown."""
+    frames: list[Result] = []
+
+    def on_frame(result: Result) -> None:
+        frames.append(result)
+        if len(frames) == 7:
+            raise _EnoughError
+
+    simulate(path, seed=1).record("night", pace=None)
+    with contextlib.suppress(_EnoughError):
+        process(Follow("night", on_frame=on_frame), "night_poses.h5")
+    app, window = open_window(path)
+    window.follow_path(Path("night_poses.h5"))
+    settle(app, window)
+    window.session.select(frame=len(frames) - 1, heliostat=2)
+    window.go_to("field")
+    settle(app, window)
+    output.write_bytes(png_of(window))
+    window.close()
+    app.processEvents()
+    print(output)
+
+
 def welcome(output: Path, path: Path) -> None:
     """Write a picture of the first page."""
     app, window = open_window(path)
@@ -178,6 +209,7 @@ def main() -> None:
         tracked = Path("tracking_100m.toml")
         tracked.write_text(shipped_scenario(tracked.name).read_text())
         live(tracked, out / "viewer_live.png")
+        following(scenario, out / "viewer_following.png")
         subprocess.run(
             [sys.executable, str(Path(__file__).resolve()), "--output", str(out), "--scaled", str(result)],
             env=os.environ | {"QT_SCALE_FACTOR": "2"},

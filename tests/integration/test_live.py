@@ -23,8 +23,9 @@ from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.pipeline import follow
 from rfpose.pipeline.follow import Follow
 from rfpose.pipeline.formats.journal import partial_of
-from rfpose.pipeline.formats.live_result import ResultFollower, open_live
+from rfpose.pipeline.formats.live_result import LiveResult, ResultFollower, open_live
 from rfpose.pipeline.formats.result import Result
+from rfpose.pipeline.formats.result_file import columns_of, result_of
 from rfpose.pipeline.publish import messages, messages_as_they_come
 from rfpose.recording.segments import open_growing
 from rfpose.scenario import Scenario
@@ -261,6 +262,41 @@ def test_a_result_that_is_replaced_is_told_to_who_follows(night: Path, plain: by
     shorter.save(output, force=True)
     with pytest.raises(RecordingError, match="was replaced by another result while it was followed"):
         follower.news()
+
+
+def test_who_follows_does_not_take_what_is_being_removed_for_a_new_beginning(
+    night: Path, plain: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = tmp_path / "r.h5"
+    whole = rf.open_result(night.parent / "plain.h5")
+    live = LiveResult(partial_of(output), whole.scenario, whole.settings, probe="", restart=False)
+    for i in range(N_FRAME):
+        live.append(_frame(whole, i))
+    follower = ResultFollower(output)
+    assert follower.news() is not None
+    output.write_bytes(plain)
+    unlink, seen = Path.unlink, []
+
+    def unlink_and_look(path: Path, missing_ok: bool = False) -> None:
+        unlink(path, missing_ok=missing_ok)
+        seen.append((path.name, follower.news()))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", unlink_and_look)
+        live.remove()
+    assert [news for _, news in seen] == [None] * (N_FRAME + 1)
+    assert seen[-1][0] == "key.json"  # on which entries depend
+    assert follower.news() is None
+    assert follower.complete
+
+
+def _frame(result: Result, i: int) -> Result:
+    columns = {
+        path: values[i : i + 1] if column.dims[0] == "frame" else values
+        for path, (column, values) in columns_of(result).items()
+        if not path.startswith("truth/")
+    }
+    return result_of(result.scenario, result.settings, columns)
 
 
 def test_digital_rf_is_followed_while_it_is_written(night: Path, site: Scenario, tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ class NativeRecording(Recording):
             self._fields = fields
             self._offsets: dict[str, IndexArray] = {}
             self._stored: dict[str, StoredSamples | None] = {}
-            self._file_number = int(self._file.id.get_vfd_handle())
+            self._file_number = int(self._file.id.get_vfd_handle()) if self._file.driver == "sec2" else -1
         except BaseException as error:
             self._file.close()
             if isinstance(error, _HDF5_ERRORS) and not isinstance(error, RfposeError):

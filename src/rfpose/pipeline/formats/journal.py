@@ -138,10 +138,16 @@ class Journal:
     def remove(self) -> None:
         """Delete the entries and, unless something else is in it, the directory."""
         try:
-            for path in list(self._directory.iterdir()):
-                if self._is_own(path):
-                    path.unlink()
+            # the first rows go first: who reads along sees all entries or none, and never fewer; and what depends on a
+            # key never outlives it
+            own = sorted((path for path in self._directory.iterdir() if self._is_own(path)), key=_removal_order)
+            for path in own:
+                path.unlink()
             if not any(self._directory.iterdir()):
                 self._directory.rmdir()
         except OSError as error:
             raise RecordingError(f"{self._directory}: cannot remove: {error.strerror or error}") from error
+
+
+def _removal_order(path: Path) -> tuple[bool, str]:
+    return path.name == _KEY_NAME, path.name

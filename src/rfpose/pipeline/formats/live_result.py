@@ -6,6 +6,7 @@ not at all, so that a reader needs no lock, and neither a killed writer nor a fu
 
 from __future__ import annotations
 
+import functools
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -158,7 +159,7 @@ def open_live(directory: str | Path, first_frame: int = 0) -> Result:
         raise RecordingError(
             f"{directory}: no result that is being made frame by frame; give such a directory, or a result"
         )
-    scenario = parse_scenario(key[_SCENARIO], source=f"{directory}:scenario")
+    scenario = _scenario_of(key[_SCENARIO], f"{directory}:scenario")
     settings = {name.removeprefix(_SETTING): text for name, text in key.items() if name.startswith(_SETTING)}
     try:
         parts = list(_frames_from(directory, first_frame))
@@ -169,6 +170,12 @@ def open_live(directory: str | Path, first_frame: int = 0) -> Result:
         raise
     except _DAMAGES as error:
         raise RecordingError(f"{directory}: damaged ({error}); process the recording again") from error
+
+
+@functools.lru_cache(maxsize=2)
+def _scenario_of(text: str, source: str) -> Scenario:
+    """Return the site, which who follows a result reads with each frame."""
+    return parse_scenario(text, source=source)
 
 
 def n_frame_in(directory: str | Path) -> int:
