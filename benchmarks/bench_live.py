@@ -192,9 +192,13 @@ def main() -> None:
     print(f"the recorder's processor time while a frame is solved: at most {1e3 * max(recorder_s):.0f} ms")
     print(f"processor time a frame, both cores together: median {1e3 * np.median(np.diff(spent_s)):.0f} ms")
     stages.show()
-    for k, (times, sizes) in enumerate(zip(np.array_split(later, 10), np.array_split(memory[1:], 10), strict=True)):
-        if asked.day:
-            print(f"  tenth {k + 1:2d}: latency median {1e3 * np.median(times):5.1f} ms, memory {sizes[-1]:.0f} MB")
+    if asked.day:
+        tenths = [np.array_split(each, 10) for each in (later, memory[1:], np.diff(spent_s))]
+        for k, (times, sizes, spent) in enumerate(zip(*tenths, strict=True)):
+            print(
+                f"  tenth {k + 1:2d}: latency median {1e3 * np.median(times):5.1f} ms, processor time a frame "
+                f"{1e3 * np.median(spent):4.1f} ms, memory {sizes[-1]:.0f} MB"
+            )
 
 
 if __name__ == "__main__":
