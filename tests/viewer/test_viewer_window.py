@@ -277,7 +277,9 @@ def test_click_on_a_mirror_shows_its_poses_and_exclusions(
     assert ["T4", "carrier not found above the noise", "9 of 9 receiver-frames"] in rows
     assert np.isfinite(view.history.ellipse_mrad).all()
     for key in ("error", "sigma", "status", "transmitters"):
-        assert view.choose_colour(key)
+        view.colour.setCurrentIndex(view.colour.findData(key))
+        view.colour.activated.emit(view.colour.currentIndex())
+        assert view.colour.currentData() == key
         assert bool(view.key.items) == (key == "status")
     view.arrows.setCurrentIndex(view.arrows.findData("residuals"))
     view._draw()
@@ -349,7 +351,8 @@ def test_mirrors_without_a_pose_are_grey_and_the_rest_is_drawn(
     view = field_of(window)
     wait(window, lambda: view.history is not None)
     assert "fewer than three receivers" in view.headline.text()
-    view.choose_colour("sigma")
+    view.colour.setCurrentIndex(view.colour.findData("sigma"))
+    view.colour.activated.emit(view.colour.currentIndex())
     view.grab()
     assert "is not beside" in window.session.message.text
 

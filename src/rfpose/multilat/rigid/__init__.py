@@ -1,4 +1,10 @@
-"""Poses of rigid mirrors from all phases of their receivers at once."""
+"""Poses of rigid mirrors from all phases of their receivers at once.
+
+To be read in this order: what is measured and known (`problem`), what of it weighs how much (`weights`), the fit
+(`pose`) and what it finds (`records`); whole wavelengths, one after the other, of a part of the problem (`parts`,
+`integers`), and together where rounding is not safe (`search`); where to begin (`start`). `places` and `delays` are
+learned over postures and frames.
+"""
 
 from rfpose.multilat.rigid.parts import part_of
 from rfpose.multilat.rigid.places import ReceiverPlaces, places_bound, refine_places

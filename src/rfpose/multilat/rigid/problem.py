@@ -242,11 +242,6 @@ class MirrorProblem:
             knowledge=knowledge,
         )
 
-    @property
-    def n_tone(self) -> int:
-        """Groups that are tones."""
-        return int(np.count_nonzero(~self.is_carrier))
-
     def observation(self, k: int) -> Observation:
         """Return one wavelength's phases."""
         return Observation(

@@ -210,14 +210,6 @@ class FieldView(View):
         if (now.heliostat, now.frame, now.transmitter) != (before.heliostat, before.frame, before.transmitter):
             self._draw()
 
-    def choose_colour(self, key: str) -> bool:
-        """Colour the mirrors by one of `COLOURS`; tells whether the document knows it."""
-        index = self.colour.findData(key)
-        if index >= 0:
-            self.colour.setCurrentIndex(index)
-            self._draw()
-        return index >= 0
-
     # -- drawing -----------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
