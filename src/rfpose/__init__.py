@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rfpose.pipeline.layout import budget, layout_map, optimise
     from rfpose.pipeline.learn import learn_pattern
     from rfpose.pipeline.process import process
+    from rfpose.pipeline.publish import publish
     from rfpose.pipeline.simulate import simulate
     from rfpose.pipeline.survey import survey
     from rfpose.pipeline.track import track
@@ -45,6 +46,7 @@ __all__ = [
     "open_track",
     "optimise",
     "process",
+    "publish",
     "shipped_scenario",
     "simulate",
     "survey",
@@ -63,6 +65,7 @@ _HOME = {
     "open_track": "pipeline.formats.track_file",
     "optimise": "pipeline.layout",
     "process": "pipeline.process",
+    "publish": "pipeline.publish",
     "shipped_scenario": "pipeline.demo",
     "simulate": "pipeline.simulate",
     "survey": "pipeline.survey",

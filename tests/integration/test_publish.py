@@ -28,7 +28,7 @@ from rfpose.pipeline.formats.journal import partial_of
 from rfpose.pipeline.formats.live_result import LiveResult
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import columns_of, result_of
-from rfpose.pipeline.publish import SCHEMA, Broker, PlantServer, messages, send, serving
+from rfpose.pipeline.publish import SCHEMA, Broker, PlantServer, SentMessages, messages, send, serving
 
 BROKER = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
 needs_broker = pytest.mark.skipif(BROKER is None, reason="needs the broker mosquitto (Debian: apt install mosquitto)")
@@ -211,6 +211,11 @@ def test_a_broker_gets_every_pose_and_the_schema(result: Result, broker: _Mosqui
     assert [m for topic, m, _ in listener.heard if topic == "a/b/schema"] == [SCHEMA]
     assert [m for topic, m, _ in listener.heard if topic == "a/b/pose/H02"] == list(messages(result))[1::2]
     assert all(once for _, _, once in listener.heard)
+    url = f"mqtt://127.0.0.1:{broker.port}"
+    for given in (result, tmp_path / "r.h5"):
+        assert rf.publish(given, Broker(url=url)) == SentMessages(
+            acknowledged=7, dropped=0, unacknowledged=0, reconnections=0
+        )
 
 
 @needs_broker

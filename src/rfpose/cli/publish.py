@@ -129,16 +129,14 @@ def command(
     if anonymous:
         raise click.UsageError("--anonymous goes with --opcua")
     session.when_interrupted = "interrupted; part of the messages may have been sent"
-    from rfpose.pipeline.formats.result_file import open_result
-    from rfpose.pipeline.publish import Broker, messages, messages_as_they_come, send
+    from rfpose.pipeline.publish import Broker, publish
 
     broker = Broker(url=str(mqtt), user=user, password=password, **asdict(keys), **asdict(to_broker))
     if follow:
-        sent = send(messages_as_they_come(_follower(result, only_new=only_new)), broker)
+        sent = publish(_follower(result, only_new=only_new), broker)
     else:
-        found = open_result(result)
         with progress("Sending") as on_progress:
-            sent = send(messages(found), broker, on_progress=on_progress, n_message=found.poses.status.size)
+            sent = publish(result, broker, on_progress=on_progress)
     told = {
         "broker": mqtt,
         "acknowledged": sent.acknowledged,
@@ -168,8 +166,7 @@ def _follower(result: Path, *, only_new: bool) -> ResultFollower:
 
 
 def _serve(result: Path, to: PlantServer, *, follower: ResultFollower | None) -> None:
-    from rfpose.pipeline.formats.result_file import open_result
-    from rfpose.pipeline.publish import serve, serve_as_they_come
+    from rfpose.pipeline.publish import publish
 
     def on_ready(address: str) -> None:
         if wants_json():
@@ -177,10 +174,7 @@ def _serve(result: Path, to: PlantServer, *, follower: ResultFollower | None) ->
         else:
             say(f"{address}: serving the last frame of {result}; Ctrl-C ends it")
 
-    if follower is not None:
-        serve_as_they_come(follower, to, on_ready=on_ready)
-    else:
-        serve(open_result(result), to, on_ready=on_ready)
+    publish(result if follower is None else follower, to, on_ready=on_ready)
 
 
 def _password(file: Path | None) -> str:

@@ -203,7 +203,7 @@ def _scene(
         permittivity[-1] = _complex(soil.permittivity, soil.conductivity_s_per_m, carrier_hz)
     edges = _edges(plates, half, boxes, box_centre, soil)
     return _kernels.StandingThings(
-        transmitter=transmitter,
+        transmitter=_solid(transmitter),
         wavenumber=2.0 * np.pi * carrier_hz / wanted.propagation_speed_mps,
         dipole=wanted.antenna == "half_wave",
         centre=_solid(plates.centre_enu_m),
@@ -275,7 +275,8 @@ def _complex(
 
 
 def _solid(array: npt.ArrayLike) -> FloatArray:
-    return np.ascontiguousarray(array, np.float64)
+    """As the kernel takes all arrays: read-only ones would be another type, for which it is compiled anew."""
+    return np.require(array, np.float64, ["C", "W"])
 
 
 def _cells(centre: FloatArray, origin: FloatArray, cell: float) -> tuple[IndexArray, IndexArray]:
@@ -322,7 +323,7 @@ def _receivers(
         pivot=_solid(mirrors.pivot_enu_m),
         rot=_solid(mirrors.rot_enu_from_mirror),
         place=_solid(place),
-        own=np.ascontiguousarray(mirrors.own_plate, np.int64),
+        own=np.require(mirrors.own_plate, np.int64, ["C", "W"]),
         near_start=near_start,
         near=near,
     )

@@ -8,6 +8,7 @@ from rfpose.feedback.servo import (
     PiLaw,
     ServoState,
     Stepper,
+    _kernels,
     check_law,
     design_law,
     is_stable,
@@ -45,6 +46,14 @@ def test_limits_of_latency_and_interval_are_where_time_series_turn(stiff, latenc
         assert (late_error < 1e-7) == settles
         each = 1.0 + (found.interval_s - 1.0) * change
         assert is_stable(LINEAR, mode, interval_s=each, latency_s=latency_s) == settles
+
+
+def test_a_loop_without_a_structure_is_not_compiled_for_again():
+    still = np.zeros((1, 3))
+    run_loop(LINEAR, EDWARDS_MODE, command_rad=still, latency_s=0.4)
+    known = list(_kernels.loop_run.signatures)
+    run_loop(LINEAR, None, command_rad=still, latency_s=0.4)
+    assert _kernels.loop_run.signatures == known
 
 
 def test_gain_margin_is_the_factor_to_instability():

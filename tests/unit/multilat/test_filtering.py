@@ -177,6 +177,18 @@ def test_many_calls_equal_one():
     np.testing.assert_array_equal(state.cov, whole.state.cov)
 
 
+def test_arrays_that_lie_otherwise_or_are_read_only_are_not_compiled_for():
+    _, (pivot, rot), cov = simulate(np.random.default_rng(4), 3, 2)
+    time = 10.0 * np.arange(3)
+    plain = filter_poses(pivot, rot, cov.copy(), time_s=time, usable=np.ones((3, 2), bool))
+    known = list(_kernels.filter_many.compiled.signatures)
+    usable = np.broadcast_to(np.True_, (3, 2))
+    time.flags.writeable = False
+    other = filter_poses(np.asfortranarray(pivot), np.asfortranarray(rot), cov, time_s=time, usable=usable)
+    assert other.normal_enu.tobytes() == plain.normal_enu.tobytes()
+    assert _kernels.filter_many.compiled.signatures == known
+
+
 def test_marked_measurements_and_missing_starts():
     rng = np.random.default_rng(8)
     _, (pivot, rot), cov = simulate(rng, 4, 2)

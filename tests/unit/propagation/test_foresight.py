@@ -21,6 +21,7 @@ from rfpose.propagation import (
     ReceiverStand,
     Soil,
     Surroundings,
+    _kernels,
     bystanders,
     foresee,
     foresight,
@@ -78,6 +79,19 @@ def test_the_direct_ray_is_the_convention_of_fields():
     assert (rays.kind[0], rays.thing[0], rays.extra_m[0]) == (RayKind.DIRECT, -1, 0.0)
     np.testing.assert_array_equal(rays.source_enu_m[0], transmitter)
     np.testing.assert_allclose(rays.field_enu[0], theta(unit(place - transmitter)) / distance, rtol=1e-12)
+
+
+def test_arrays_that_are_read_only_are_not_compiled_for():
+    place, transmitter = np.array([[3.0, 4.0, 2.0]]), np.array([[30.0, -40.0, 25.0]])
+    stand, carrier = bystanders(place), np.array([CARRIER_HZ])
+    rot, own = np.array(stand.rot_enu_from_mirror), np.array(stand.own_plate)
+    stand = replace(stand, rot_enu_from_mirror=rot, own_plate=own)
+    foresee(transmitter, carrier, stand, BARE)
+    known = list(_kernels.rays_of_mirrors.compiled.signatures)
+    for array in (transmitter, carrier, rot, own):
+        array.flags.writeable = False
+    foresee(transmitter, carrier, stand, BARE)
+    assert _kernels.rays_of_mirrors.compiled.signatures == known
 
 
 @pytest.mark.parametrize("far_m", [1.0, 20.0, 77.459667, 300.0, 3e4])

@@ -110,7 +110,7 @@ def _over(a: FloatArray, b: FloatArray, time_s: float) -> tuple[FloatArray, Floa
     block = np.zeros((n + 1, n + 1))
     block[:n, :n], block[:n, n] = a, b
     moved = expm(block * time_s)
-    return moved[:n, :n], moved[:n, n]
+    return np.ascontiguousarray(moved[:n, :n]), np.ascontiguousarray(moved[:n, n])  # else another type to kernels
 
 
 def sampled_plant(structure: StructureMode | None, *, interval_s: float, latency_s: float = 0.0) -> SampledPlant:

@@ -235,12 +235,14 @@ def filter_poses(
     shape = (n_frame, n_mirror)
     out = [np.full((*shape, *a.shape[1:]), np.nan) for a in now]
     status, parts, distance = np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.full(shape, np.nan)
+    # arrays that are read-only or lie otherwise would be other types, for which all is compiled anew
+    pivot, rot, noise, time = (np.require(a, requirements=["C", "W"]) for a in (pivot, rot, noise, time))
     _kernels.filter_many(
         n_mirror,
         pivot,
         rot,
         noise,
-        use,
+        np.require(use, requirements=["C", "W"]),
         float(exposure_s),
         how.rate_walk_radps_per_sqrt_s**2,
         how.pivot_walk_m_per_sqrt_s**2,
