@@ -274,9 +274,16 @@ def _take_scipy_as_there() -> None:
         linalg.ensure_blas = ask
 
 
+def _understood(options: dict[str, Any], target: type) -> dict[str, Any]:
+    """Leave out what this numba does not know; what is of its own and may go only saves time."""
+    return {name: value for name, value in options.items() if not name.startswith("_") or hasattr(target, name)}
+
+
 def _compiled(numba: Any, function: Function, options: dict[str, Any]) -> Function:
     """Hand a function to numba, with its cache if there is a place for it."""
-    dispatcher = numba.njit(**_COMMON, **options)(function)
+    from numba.core.cpu import CPUTargetOptions
+
+    dispatcher = numba.njit(**_understood(_COMMON | options, CPUTargetOptions))(function)
     try:
         dispatcher._cache = _cache_class()(function)
     except RuntimeError as error:

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from rfpose.jit import kernel_rows, one_thread
+from rfpose.jit import kernel_lean, kernel_rows, one_thread
 
 
 @kernel_rows
@@ -88,3 +88,22 @@ def test_a_full_disk_costs_what_would_be_kept_and_not_the_work(tmp_path):
     assert done.stdout == "6.0\n"
     assert "compiled kernels cannot be kept: File too large" in done.stderr
     assert list(tmp_path.rglob("*.nb*")) == []
+
+
+@pytest.mark.parametrize("numba_knows", [True, False])
+def test_a_numba_without_its_own_option_compiles_all_the_same(monkeypatch, numba_knows):
+    from numba.core.cpu import CPUTargetOptions
+
+    if not numba_knows:
+        monkeypatch.delattr(next(each for each in CPUTargetOptions.__mro__ if "_nrt" in vars(each)), "_nrt")
+
+    @kernel_lean
+    def total(value):
+        found = 0.0
+        for i in range(len(value)):
+            found += value[i]
+        return found
+
+    assert total(np.arange(4.0)) == 6.0
+    # what is not compiled but comes from the cache is not looked at
+    assert ("_nrt" in total.compiled.targetoptions) == numba_knows

@@ -27,7 +27,9 @@ from rfpose.scenario import Scenario
 __all__ = ["JOURNAL_SAMPLES", "FrameByFrame", "OtherProcesses", "extractors", "journal_key", "measure_tones"]
 
 JOURNAL_SAMPLES = 40_000_000
-"""Samples measured here between two entries of the journal, and by each thread elsewhere: less than a second's work."""
+"""Samples measured here between two entries of the journal: a small part of a second's work for each core."""
+_LONGER_ELSEWHERE = 4
+"""So many times as long are entries for each thread elsewhere, which has nothing to do from one to the next."""
 
 _PER_THREAD = 4
 """Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another, and so few that
@@ -330,7 +332,7 @@ def _share_elsewhere(bench: _Bench, elsewhere: OtherProcesses, team: Team) -> _S
         recipe=bench.recipe,
     )
     packed = _Packed(key=place.key, place=pickle.dumps(place))
-    return _Share(bench.rows_of(JOURNAL_SAMPLES * team.n_at_once), groups, _measure_there, packed)
+    return _Share(bench.rows_of(_LONGER_ELSEWHERE * JOURNAL_SAMPLES * team.n_at_once), groups, _measure_there, packed)
 
 
 # -- where it is done ----------------------------------------------------------------------------------------
