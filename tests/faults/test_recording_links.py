@@ -79,11 +79,12 @@ def outside(path, private, how):
         file = path if path.is_file() else next((path / "a").rglob("rf@*.h5"))
         place = "receivers/a/iq" if path.is_file() else "rf_data"
         with h5py.File(file, "r+") as f:
-            dtype, n = f[place].dtype, f[place].shape
+            dtype, n, stored = f[place].dtype, f[place].shape, f[place][()]
             del f[place]
             if how == "external link":
                 with h5py.File(private.parent / "x.h5", "w") as other:
-                    other.create_dataset("iq", n, dtype)
+                    other.create_dataset("before", data=np.ones(1000))  # so that samples lie elsewhere in it
+                    other.create_dataset("iq", data=stored)
                 f[place] = h5py.ExternalLink(str(private.parent / "x.h5"), "/iq")
             elif how == "soft link":
                 with h5py.File(private.parent / "x.h5", "w") as other:
@@ -111,19 +112,23 @@ WAYS = [
 @pytest.mark.parametrize(("format", "how"), WAYS, ids=[f"{format} {how}" for format, how in WAYS])
 def test_nothing_outside_the_recording_is_read_unasked(make, private, format, how):
     path = make(format)
-    outside(path, private, how)
 
     def read(**settings):
         with open_recording(path, **settings) as recording:
             start, count = recording.blocks("a")[0].tolist()
             return recording.read("a", start, count)
 
+    before = read()
+    outside(path, private, how)
     with pytest.raises(RecordingError, match=r"is not read; .*add `follow_links=True`") as caught:
         read()
     assert str(path) in str(caught.value)
     if how == "scenario link":
         return  # which is none, so it cannot be read either way
-    assert len(read(follow_links=True)) > 0
+    found = read(follow_links=True)
+    assert len(found) > 0
+    if how in ("external link", "channel link", "file link"):
+        np.testing.assert_array_equal(found, before)
 
 
 def test_links_within_the_recording_are_fine(make):

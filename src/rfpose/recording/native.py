@@ -51,6 +51,7 @@ class NativeRecording(Recording):
 
     def __init__(self, path: Path, *, scenario: Scenario | None = None, follow_links: bool = False) -> None:
         self._file = _open_hdf5(path)
+        self._follow_links = follow_links
         try:
             fields = _Fields(path, self._file, follow_links=follow_links)
             fields.check_format()
@@ -107,7 +108,8 @@ class NativeRecording(Recording):
 
     def _where(self, receiver_id: str) -> StoredSamples | None:
         if receiver_id not in self._stored:
-            self._stored[receiver_id] = where_stored(self._iq[receiver_id])
+            # places are of this file, and what links lead to may stand in another
+            self._stored[receiver_id] = None if self._follow_links else where_stored(self._iq[receiver_id])
         return self._stored[receiver_id]
 
     def _load_segments(self, receiver_id: str) -> IndexArray:
