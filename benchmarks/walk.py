@@ -1,14 +1,16 @@
 """Print the way from a recording to its normals, as somebody walks it who reads the code.
 
-    python benchmarks/walk.py
+    python benchmarks/walk.py [--frame-samples 8000]
 
 Each function is read once, where it is first called, depth first. A step goes from a function into one of another file;
 a return is a step into a file that was left already. Left out: kernels, how records check themselves, and what every
-part leans on (checks, errors, geometry, scenario, recording). What threads do for receivers is not followed.
+part leans on (checks, errors, geometry, scenario, recording). What threads do for receivers is not followed; short
+frames are measured without threads, and what is done for a receiver shows.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 from types import CodeType, FrameType
@@ -96,10 +98,10 @@ def from_phases(steps: list[Step]) -> list[Step]:
     ]
 
 
-def small_recording() -> rf.Recording:
-    """Return two mirrors in two frames, so long that threads measure them."""
+def small_recording(frame_samples: int = 200_000) -> rf.Recording:
+    """Return two mirrors in two frames; by default so long that threads measure them."""
     site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
-    small = {"radio": {"frame_samples": 200_000}, "simulation": {"frame_count": 2}}
+    small = {"radio": {"frame_samples": frame_samples}, "simulation": {"frame_count": 2}}
     return rf.simulate(site.changed(heliostat=site.heliostat[:2], **small), seed=1)
 
 
@@ -111,7 +113,9 @@ def summary(steps: list[Step]) -> str:
 
 def main() -> None:
     """Process a small recording twice, the second time watched."""
-    recording = small_recording()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frame-samples", type=int, default=200_000)
+    recording = small_recording(parser.parse_args().frame_samples)
     rf.process(recording)
     steps = walked(recording)
     seen: set[str] = set()
