@@ -29,8 +29,19 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from distributed import Client, Future
+    from threadpoolctl import ThreadpoolController
 
-__all__ = ["Engine", "Team", "gathered", "is_elsewhere", "n_core", "team_here", "team_of", "worker_pool"]
+__all__ = [
+    "Engine",
+    "Team",
+    "gathered",
+    "is_elsewhere",
+    "n_core",
+    "one_thread_of_blas",
+    "team_here",
+    "team_of",
+    "worker_pool",
+]
 
 Shared = TypeVar("Shared")
 Item = TypeVar("Item")
@@ -172,7 +183,7 @@ def team_here(*, alone: bool = False) -> Iterator[Team]:
         interpreter, which takes longer to hand over than a piece to do.
     """
     if alone:
-        with _one_thread_of_blas():
+        with one_thread_of_blas():
             yield _Here(None, 1)
         return
     with worker_pool() as pool:
@@ -200,7 +211,7 @@ def worker_pool() -> Iterator[Executor]:
     switch_interval = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
-        with _one_thread_of_blas(), ThreadPoolExecutor(n_core(), "rfpose") as pool:
+        with one_thread_of_blas(), ThreadPoolExecutor(n_core(), "rfpose") as pool:
             try:
                 yield pool
             finally:
@@ -209,11 +220,29 @@ def worker_pool() -> Iterator[Executor]:
         sys.setswitchinterval(switch_interval)
 
 
-def _one_thread_of_blas() -> contextlib.AbstractContextManager[object]:
-    from threadpoolctl import threadpool_limits
+def one_thread_of_blas(*, scipy: bool = False) -> contextlib.AbstractContextManager[object]:
+    """Keep BLAS to the thread that calls it.
 
-    limits: contextlib.AbstractContextManager[object] = threadpool_limits(limits=1, user_api="blas")
-    return limits
+    Parameters
+    ----------
+    scipy
+        Scipy's too, which brings one of its own: it is loaded, since what is not there cannot be held.
+    """
+    from threadpoolctl import ThreadpoolController
+
+    held: contextlib.AbstractContextManager[object] = (_blas_of_both() if scipy else ThreadpoolController()).limit(
+        limits=1, user_api="blas"
+    )
+    return held
+
+
+@functools.cache
+def _blas_of_both() -> ThreadpoolController:
+    """Return the hold on numpy's and scipy's BLAS, which takes milliseconds to find."""
+    import scipy.linalg  # noqa: F401 -- loads it
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 class _Here:
@@ -362,9 +391,7 @@ def _settle() -> None:
     Dask starts workers with ``MALLOC_TRIM_THRESHOLD_``, by which each array of a frame goes back to the system and its
     pages are asked for anew with the next frame: half as fast. The thresholds are those that glibc else finds.
     """
-    from threadpoolctl import threadpool_limits
-
-    threadpool_limits(limits=1, user_api="blas")
+    one_thread_of_blas(scipy=True)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     with contextlib.suppress(OSError, AttributeError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt

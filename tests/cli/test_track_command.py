@@ -2,6 +2,9 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -122,6 +125,19 @@ def test_blas_keeps_to_one_thread(site):
         track(site, methods=("open-loop",), heliostats=1, on_progress=lambda *now: seen.extend(threads(*now)))
         assert set(threads()) == {2}
     assert set(seen) == {1}
+
+
+def test_blas_that_comes_later_keeps_to_one_thread_too(site):
+    """Scipy brings one of its own, which a fresh process does not have yet when the track begins."""
+    text = (
+        "import sys, rfpose as rf; from threadpoolctl import threadpool_info\n"
+        "def told(*_): print(*(lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'))\n"
+        "rf.track(sys.argv[1], methods=['radio'], heliostats=1, on_progress=told)"
+    )
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", text, site], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert set(done.stdout.splitlines()) == {"1 1"}
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,10 @@ _PER_THREAD = 4
 """Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another, and so few that
 giving them out costs little."""
 
-_FOR_THREADS_SAMPLES = 200_000
-"""Of a frame; in shorter ones a kernel takes less time than it takes a thread to get the interpreter back."""
 _PER_THREAD_HERE = 16
 """The same for each thread here, to which they go in no time."""
+_FOR_THREADS_SAMPLES = 200_000
+"""Of a frame; in shorter ones a kernel takes less time than it takes a thread to get the interpreter back."""
 
 _MAX_ENTRY_ROWS = 4096
 _PROBE_SAMPLES = 1024

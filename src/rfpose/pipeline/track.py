@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from threadpoolctl import threadpool_limits
-
 from rfpose import __version__
-from rfpose.engine import is_elsewhere, team_of
+from rfpose.engine import is_elsewhere, one_thread_of_blas, team_of
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.files import claim
 from rfpose.pipeline.formats.checkpoint import Checkpoint
@@ -109,7 +108,7 @@ def track(
     """
     place = None if output is None else Path(output).with_name(f".{Path(output).name}.state")
     given = None if isinstance(scenario, Scenario) else scenario
-    with claim(output, inputs=[given, place], force=force) as job:
+    with claim(output, inputs=[given, place], force=force) as job, contextlib.ExitStack() as held:
         base = scenario_of(scenario)
         with naming(scenario):
             site = _with(base, changes)
@@ -122,38 +121,36 @@ def track(
         from rfpose.pipeline.track_iq import check_with_iq
 
         # its matrices are too small to share: a second thread would take another program's core to wait on
-        with threadpool_limits(1, user_api="blas"):
-            with naming(scenario):
-                simulation = TrackingSimulation(site, methods=methods, count=heliostats, seed=seed)
-            settings = {
-                "version": __version__,
-                "seed": str(seed),
-                "methods": " ".join(m.name for m in simulation.methods),
-                "heliostats": str(len(simulation.field)),
-            }
-            digests = {name: _digest(path) for name, path in records.items() if path is not None}
-            key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()} | digests
-            checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
-            state = None if checkpoint is None else checkpoint.read()
-            with naming(scenario):
-                iq = check_with_iq(site, check_iq, seed=seed)
-            if state is not None:
-                simulation.restore(state)
-            run = (
-                _run_elsewhere(simulation, _Job.of(site, heliostats, seed, digests))
-                if is_elsewhere()
-                else _run(simulation)
-            )
-            for done, total in run:
-                if checkpoint is not None:
-                    checkpoint.write(simulation.state())
-                if on_progress is not None:
-                    on_progress(done, total)
-            found = track_of(simulation, settings, iq=iq)
-            if output is not None:
-                write_track(found, output)
+        held.enter_context(one_thread_of_blas(scipy=True))
+        with naming(scenario):
+            simulation = TrackingSimulation(site, methods=methods, count=heliostats, seed=seed)
+        settings = {
+            "version": __version__,
+            "seed": str(seed),
+            "methods": " ".join(m.name for m in simulation.methods),
+            "heliostats": str(len(simulation.field)),
+        }
+        digests = {name: _digest(path) for name, path in records.items() if path is not None}
+        key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()} | digests
+        checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
+        state = None if checkpoint is None else checkpoint.read()
+        with naming(scenario):
+            iq = check_with_iq(site, check_iq, seed=seed)
+        if state is not None:
+            simulation.restore(state)
+        run = (
+            _run_elsewhere(simulation, _Job.of(site, heliostats, seed, digests)) if is_elsewhere() else _run(simulation)
+        )
+        for done, total in run:
             if checkpoint is not None:
-                job.afterwards(checkpoint.remove)
+                checkpoint.write(simulation.state())
+            if on_progress is not None:
+                on_progress(done, total)
+        found = track_of(simulation, settings, iq=iq)
+        if output is not None:
+            write_track(found, output)
+        if checkpoint is not None:
+            job.afterwards(checkpoint.remove)
         return found
 
 

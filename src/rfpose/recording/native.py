@@ -178,15 +178,6 @@ def _open_hdf5(path: Path) -> h5py.File:
         ) from error
 
 
-def _place_of(dataset: h5py.Dataset) -> int | None:
-    """Return where values lie one after the other in their file [byte]; None: they do not."""
-    settings = dataset.id.get_create_plist()
-    if settings.get_layout() != h5py.h5d.CONTIGUOUS or settings.get_external_count():
-        return None
-    begin: int | None = dataset.id.get_offset()
-    return begin
-
-
 class _Fields:
     """Typed access to what is in the file; whatever is missing or mistyped is named."""
 
@@ -364,7 +355,8 @@ class _Fields:
     def place_of_blocks(self, receiver_id: str) -> int | None:
         """Return where a receiver's table of blocks lies [byte]; None: nowhere as a whole."""
         place = f"/{keys.RECEIVERS}/{receiver_id}/{keys.BLOCKS}"
-        return _place_of(self._dataset(place, "a table of int64", within=self._receiver(receiver_id)))
+        begin: int | None = self._dataset(place, "a table of int64", within=self._receiver(receiver_id)).id.get_offset()
+        return begin
 
     def places_of_truth(self) -> list[tuple[int, int]]:
         """Return where numbers of the truth lie, and how long they are [byte]."""
@@ -372,7 +364,7 @@ class _Fields:
         for name in _TRUTH_AXES if self._holds(f"/{keys.TRUTH}") else ():
             if self._holds(f"/{keys.TRUTH}/{name}"):
                 dataset = self._dataset(f"/{keys.TRUTH}/{name}", "numbers")
-                if (begin := _place_of(dataset)) is not None:
+                if (begin := dataset.id.get_offset()) is not None:
                     found.append((begin, dataset.nbytes))
         return found
 

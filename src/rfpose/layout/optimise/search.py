@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import ThreadpoolController
 
 from rfpose.checks import FloatArray, as_float_array, as_positive, read_only
-from rfpose.engine import gathered
+from rfpose.engine import gathered, one_thread_of_blas
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.jit import one_thread
 from rfpose.layout.maps import PosedMirrors, kernel_field, plane_slope
@@ -199,14 +197,8 @@ def _rows(
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Search on one core: a few hundred points and tiny matrices, where threads only wait for each other."""
-    with one_thread(), _blas().limit(limits=1, user_api="blas"):
+    with one_thread(), one_thread_of_blas(scipy=True):
         yield
-
-
-@functools.cache
-def _blas() -> ThreadpoolController:
-    """Return the hold on BLAS, which takes milliseconds to find; it is loaded by now."""
-    return ThreadpoolController()
 
 
 def statistic_of(variance: FloatArray, statistic: str, *, smooth: bool) -> tuple[float, FloatArray]:
