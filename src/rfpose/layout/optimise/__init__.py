@@ -10,6 +10,7 @@ from rfpose.layout.optimise.search import (
     efficient,
     evaluate_placement,
     optimise,
+    pegged,
 )
 
 __all__ = [
@@ -27,4 +28,5 @@ __all__ = [
     "exchange",
     "measured",
     "optimise",
+    "pegged",
 ]

@@ -21,7 +21,7 @@ from rfpose.layout.optimise.rules import Constraints, Costs
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-__all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "efficient", "evaluate_placement", "optimise"]
+__all__ = ["CRITERIA", "Criterion", "Placement", "Progress", "efficient", "evaluate_placement", "optimise", "pegged"]
 
 Criterion = Literal["pdop", "independent", "rigid", "shared-clock"]
 CRITERIA: dict[str, int] = {
@@ -41,6 +41,8 @@ _WORST_POWER = 12.0
 _BAND = 0.02
 """Width of the ranks that stand for a percentile while searching, so that it has a slope."""
 FEASIBLE = 1e-6
+_ROUNDING_M = 1e-9
+"""By less a height in round numbers is not beyond its limit."""
 _UNUSED = np.empty((0, 0, 3, 3))
 """Slopes of planes where no plane is laid through receivers."""
 _FEW_POINTS = 5000
@@ -342,6 +344,35 @@ def problem_of(
         scale=max(float(np.ptp(corners, axis=0).max()), 1e-9),
         heliostats=KDTree(field.pivot_enu_m[:, :2]) if constraints.clearance_m > 0.0 else None,
     )  # fmt: skip
+
+
+def pegged(
+    place_enu_m: FloatArray, existing_enu_m: FloatArray, field: PosedMirrors, constraints: Constraints, *, step_m: float
+) -> FloatArray:
+    """Return towers' places in round numbers, each the nearest that keeps the rules.
+
+    Parameters
+    ----------
+    place_enu_m : (tower, xyz)
+        As found; they keep the rules.
+    existing_enu_m : (tower, xyz)
+        Towers that stay.
+    field, constraints
+        As for `optimise`.
+    step_m
+        What places are to be multiples of. Where no neighbour among these keeps the rules, the nearest is taken.
+    """
+    problem = problem_of(field, "pdop", "rms", 1.0, existing_enu_m, constraints)
+    low, high = constraints.height_m
+    around = step_m * np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    out = place_enu_m.copy()
+    for i, place in enumerate(place_enu_m):
+        near = step_m * np.round((place + around) / step_m)
+        near = near[np.argsort(np.linalg.norm(near - place, axis=1), kind="stable")]
+        others = np.vstack([existing_enu_m, np.delete(out, i, axis=0)])[:, :2]
+        keeps = problem.is_free(near, others) & (near[:, 2] >= low - _ROUNDING_M) & (near[:, 2] <= high + _ROUNDING_M)
+        out[i] = near[np.argmax(keeps)]
+    return out
 
 
 def _check(criterion: str, statistic: str) -> None:

@@ -497,7 +497,8 @@ def optimise(
             # the best of all places is the best of those in no line, if it is one of them
             if wide.crossed(found.transmitter_enu_m[task.keep :]):
                 found = task.place(n, lambda k, total: tell(total + k, 2 * total))
-        new = step_m * np.round(found.transmitter_enu_m[task.keep :] / step_m)
+        kept = replace(task.constraints, sight=sight)
+        new = search.pegged(found.transmitter_enu_m[task.keep :], now[: task.keep], task.field, kept, step_m=step_m)
         places = np.vstack([now[: task.keep], new])
         better = task.scenario.with_transmitters(maps.check_site(places))
         before, value = task.value(now), task.value(places)
