@@ -98,7 +98,7 @@ def from_phases(steps: list[Step]) -> list[Step]:
     ]
 
 
-def small_recording(frame_samples: int = 200_000) -> rf.Recording:
+def small_recording(frame_samples: int = 400_000) -> rf.Recording:
     """Return two mirrors in two frames; by default so long that threads measure them."""
     site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml"))
     small = {"radio": {"frame_samples": frame_samples}, "simulation": {"frame_count": 2}}
@@ -114,7 +114,7 @@ def summary(steps: list[Step]) -> str:
 def main() -> None:
     """Process a small recording twice, the second time watched."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frame-samples", type=int, default=200_000)
+    parser.add_argument("--frame-samples", type=int, default=400_000)
     recording = small_recording(parser.parse_args().frame_samples)
     rf.process(recording)
     steps = walked(recording)

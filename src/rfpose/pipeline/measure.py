@@ -37,7 +37,7 @@ giving them out costs little."""
 
 _PER_THREAD_HERE = 16
 """The same for each thread here, to which they go in no time."""
-_FOR_THREADS_SAMPLES = 200_000
+_FOR_THREADS_SAMPLES = 400_000
 """Of a frame; in shorter ones a kernel takes less time than it takes a thread to get the interpreter back."""
 
 _MAX_ENTRY_ROWS = 4096
