@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from rfpose.errors import RecordingError
+from rfpose.heaps import open_hdf5
 
 __all__ = [
     "COMPRESSED_SIGMF",
@@ -97,10 +98,8 @@ def is_hdf5(path: str | Path) -> bool:
 
 
 def _kind_of_hdf5(path: Path) -> str | None:
-    import h5py
-
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             found = file.attrs.get("format")
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):
         return None

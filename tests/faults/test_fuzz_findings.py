@@ -1,16 +1,23 @@
 """Inputs that a fuzzer found to do harm, made as small as they can be; `scripts/fuzz` looks for more."""
 
 import json
+import shutil
+import subprocess
+import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import rfpose as rf
 from rfpose.errors import InvalidInputError, RecordingError
 from rfpose.feedback.series import Quantity, read_series_csv
 from rfpose.foreign import read_arrays
+from rfpose.heaps import check_heaps
 from rfpose.pipeline.inspect import inspect_file
 
+ROOT = Path(__file__).resolve().parents[2]
 WIND = Quantity(name="speed", units={"mps": 1.0}, unit="m/s", most=100.0, beyond="any wind")
 
 
@@ -45,3 +52,33 @@ def test_what_info_tells_of_mounts_is_ready_for_json(tmp_path):
     assert found["heliostats"]["H1"]["noise_mrad"] is None  # never calibrated
     json.dumps(found, allow_nan=False)
     assert np.isfinite(found["heliostats"]["H1"]["pivot_enu_m"]).all()
+
+
+@pytest.mark.parametrize("kind", ["recording", "antenna"])
+def test_free_space_of_no_length_in_a_heap_of_texts_is_refused(tmp_path, kind):
+    """The HDF5 library would stand still there, which no signal to Python ends: so it is tried in another process."""
+    path = tmp_path / f"{kind}.h5"
+    if kind == "recording":
+        site = rf.load_scenario(rf.shipped_scenario("table2.toml"))
+        rf.simulate(site.changed(radio={"frame_samples": 40_000}, simulation={"frame_count": 1})).save(path)
+    else:
+        shutil.copy(ROOT / "data" / "antenna_front_433MHz.h5", path)
+    stored = bytearray(path.read_bytes())
+    at = heap = stored.index(b"GCOL\1\0\0\0")
+    at += 16
+    while stored[at] or stored[at + 1]:  # an object's index; that of free space is zero
+        at += 16 + (int.from_bytes(stored[at + 8 : at + 16], "little") + 7) // 8 * 8
+    assert at < heap + int.from_bytes(stored[heap + 8 : heap + 16], "little") - 16
+    stored[at + 8 : at + 16] = bytes(8)
+    path.write_bytes(stored)
+    done = subprocess.run(
+        [sys.executable, "-c", "import rfpose.cli; rfpose.cli.main()", "info", path],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 3
+    assert f"{path}: the HDF5 file is damaged" in done.stderr
+    assert "copy it again" in done.stderr
+    with pytest.raises(OSError, match=f"heap of texts at byte {heap} is damaged at byte {at}"):
+        check_heaps(path, everywhere=True)

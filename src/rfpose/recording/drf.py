@@ -20,6 +20,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, install_remedy
 from rfpose.foreign import exact_number, exact_rate
+from rfpose.heaps import open_hdf5
 from rfpose.recording.base import IndexArray, IqArray, Recording, SampleFormat
 from rfpose.recording.hdf5 import FROM_SAMPLES, FROM_TABLE, find_dataset, find_item, printable
 from rfpose.recording.links import refuse_tree_outside
@@ -206,7 +207,7 @@ class DigitalRfRecording(Recording):
     def _pieces_in(self, channel: str, path: Path) -> list[_Piece]:
         """Return the stretches in one file; a file to which nothing was written has none."""
         try:
-            with h5py.File(path, "r") as file:
+            with open_hdf5(path) as file:
                 if file.get("rf_data", getlink=True) is None or file.get("rf_data_index", getlink=True) is None:
                     self._tell(channel, f"its file `{path.name}` is corrupt: it holds no samples")
                     return []
@@ -244,7 +245,7 @@ class DigitalRfRecording(Recording):
         if channel not in self._opened or self._opened[channel][0] != path:
             if channel in self._opened:
                 self._opened.pop(channel)[1].close()
-            file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES // len(self._channels))
+            file = open_hdf5(path, rdcc_nbytes=_CACHE_BYTES // len(self._channels))
             try:
                 self._opened[channel] = path, file, _samples(file, self._channels[channel], self._follow_links)
             except BaseException:
@@ -313,7 +314,7 @@ class DigitalRfRecording(Recording):
 def _channel(library: Any, properties: Path, *, follow_links: bool) -> _Channel:
     """Read a channel's properties and list its files."""
     try:
-        with h5py.File(properties, "r") as file:
+        with open_hdf5(properties) as file:
             found = {name: _scalar(value) for name, value in file.attrs.items()}
     except _HDF5_ERRORS as error:
         raise _unreadable(properties, properties.parent.name, error) from error
@@ -478,10 +479,10 @@ def _tunings(library: Any, channel: _Channel, *, follow_links: bool) -> dict[int
     path = directory / "dmd_properties.h5"
     try:
         if path.is_file():
-            with h5py.File(path, "r") as file:
+            with open_hdf5(path) as file:
                 scale = channel.rate / _rate({name: _scalar(value) for name, value in file.attrs.items()})
         for path in files:
-            with h5py.File(path, "r") as file:
+            with open_hdf5(path) as file:
                 for index in file:
                     place = f"/{index}/{CENTRE_FREQUENCIES}"
                     if not (index.isascii() and index.isdigit() and len(index) < 20):

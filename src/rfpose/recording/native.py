@@ -15,6 +15,7 @@ import numpy as np
 
 from rfpose.errors import InvalidInputError, RecordingError, RfposeError
 from rfpose.foreign import exact_rate
+from rfpose.heaps import open_hdf5
 from rfpose.kinds import told_kind
 from rfpose.recording import keys
 from rfpose.recording.alike import Layout
@@ -165,14 +166,15 @@ def _open_hdf5(path: Path) -> h5py.File:
                 f"{path}: not an HDF5 file; give an rfpose-iq file, a Digital RF directory or a SigMF recording"
             )
         # no chunk cache: each sample is read once, straight into the caller's buffer
-        return h5py.File(path, "r", rdcc_nbytes=0)
+        return open_hdf5(path, rdcc_nbytes=0)
     except RecordingError:
         raise
     except OSError as error:
-        if "truncated file" in str(error):
-            raise RecordingError(
-                f"{path}: the HDF5 file is truncated ({error}); copy it again, or record or simulate again"
-            ) from error
+        for damage in ("truncated", "damaged"):
+            if damage in str(error):
+                raise RecordingError(
+                    f"{path}: the HDF5 file is {damage} ({error}); copy it again, or record or simulate again"
+                ) from error
         raise RecordingError(
             f"{path}: cannot open: {error.strerror or error}; check the file and its rights"
         ) from error

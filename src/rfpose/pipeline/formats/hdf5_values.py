@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rfpose.checks import read_only
 from rfpose.errors import RecordingError, ScenarioError
+from rfpose.heaps import open_hdf5
 from rfpose.kinds import check_kind
 from rfpose.pipeline.formats.columns import Column
 from rfpose.recording.hdf5 import FROM_SAMPLES, find_dataset, find_item
@@ -82,7 +83,7 @@ def opened(path: Path, *, wanted: str, version: int, again: str) -> Iterator[h5p
     """
     check_kind(path, wanted=wanted)
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path, tables=True) as file:
             found = file.attrs.get("version")
             if found != version:
                 raise RecordingError(f"{path}: has version {found}, this rfpose reads {version}; {again}")
