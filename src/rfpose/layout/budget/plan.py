@@ -103,11 +103,30 @@ class WorkingPoint:
 
     @property
     def transmitter_sigma_m(self) -> FloatArray:
-        """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m]."""
+        """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m].
+
+        Where it knows a reflection, without what the calibration's survey adds: that is `survey_slope`.
+        """
         out = np.full(self.waves.wavelength_m.shape, np.inf)
         noise = self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
-        out[: self.waves.n_tone] = calibration_sigma_m(noise, self.survey_sigma_m)
+        tones = calibration_sigma_m(noise, self.survey_sigma_m)
+        if self.reflects and len(noise):
+            tones = np.sqrt(((self.calibration_weight * noise) ** 2).sum(axis=0))
+        out[: self.waves.n_tone] = tones
         return out
+
+    @property
+    def survey_slope(self) -> FloatArray:
+        """(group, transmitter, draw) what unit draws of the calibration receivers' places do to calibrated ranges [m]."""
+        n = len(self.survey_sigma_m)
+        root = np.einsum("cgta,c,cd->cgtda", self.calibration_by_place, self.survey_sigma_m, np.eye(n))
+        out = np.zeros((*self.waves.wavelength_m.shape, 3 * n))
+        out[: self.waves.n_tone] = -self.calibration_mean(root.reshape(*root.shape[:3], 3 * n))
+        return out
+
+    def calibration_mean(self, range_m: FloatArray) -> FloatArray:
+        """(tone, transmitter, …) what ranges of the calibration receivers (…, tone, transmitter, …) come to [m]."""
+        return np.asarray(np.einsum("cgt,cgt...->gt...", self.calibration_weight, range_m))
 
     @property
     def reflects(self) -> bool:
@@ -145,8 +164,7 @@ class WorkingPoint:
         shift = np.moveaxis(self.shift_m(transmitter, self.mirrors.receiver_enu_m, reflector), -1, 1)
         if self.scenario.calibration_receiver:
             there = self.shift_m(transmitter, self.scenario.calibration_enu_m, reflector, tones_only=True)
-            mean = np.einsum("ctg,cgt->gt", there, self.calibration_weight)
-            shift[:, : self.waves.n_tone] -= mean[:, None]
+            shift[:, : self.waves.n_tone] -= self.calibration_mean(np.swapaxes(there, 1, 2))[:, None]
         return shift
 
     @property
@@ -185,7 +203,9 @@ class WorkingPoint:
         if self.reflects:
             direct = _directions(self.scenario.transmitter_enu_m, self.mirrors.receiver_enu_m)
             reflection = ReflectionBend(
-                place_slope=self.by_place - direct[:, None], shared_slope=self._coefficient_slope()
+                place_slope=self.by_place - direct[:, None],
+                shared_slope=self._coefficient_slope(),
+                survey_slope=self.survey_slope,
             )
         return normal_gain(
             self.scenario.transmitter_enu_m,

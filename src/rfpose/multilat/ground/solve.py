@@ -251,8 +251,9 @@ def _coefficient_cov(problem: GroundProblem, state: RigidFits) -> FloatArray:
 
 def joint_covariance(state: RigidFits, coefficient_cov: FloatArray) -> FloatArray:
     """(mirror, unknown + parameter, unknown + parameter) of pose, clocks and coefficients."""
-    n_mirror, n_own, n_parameter = state.follow.shape
-    follow = state.follow
+    n_mirror, _, n_parameter = state.follow.shape
+    n_own = state.cov.shape[1]
+    follow = state.follow[:, :n_own]
     out = np.empty((n_mirror, n_own + n_parameter, n_own + n_parameter))
     out[:, :n_own, :n_own] = state.cov + follow @ coefficient_cov @ np.swapaxes(follow, 1, 2)
     out[:, :n_own, n_own:] = follow @ coefficient_cov
