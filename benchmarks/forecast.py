@@ -39,21 +39,6 @@ def whole(found: Result, n_wavelength: int) -> np.ndarray:
     return (found.poses.status == PoseStatus.OK)[0] & (found.poses.n_wavelength[0] == n_wavelength)
 
 
-def as_built(scenario: Scenario, rng: np.random.Generator) -> Scenario:
-    """Return the site as it is: what was surveyed lies elsewhere, by what surveys are off."""
-
-    def off(place_m: tuple[float, ...], sigma_m: float | None) -> list[float]:
-        return (np.array(place_m) + rng.normal(0.0, 1.0, 3) * (sigma_m or 0.0)).tolist()
-
-    return scenario.changed(
-        heliostat=[{**h.model_dump(), "pivot_enu_m": off(h.pivot_enu_m, h.pivot_sigma_m)} for h in scenario.heliostat],
-        calibration_receiver=[
-            {**c.model_dump(), "position_enu_m": off(c.position_enu_m, c.survey_sigma_m)}
-            for c in scenario.calibration_receiver
-        ],
-    )
-
-
 def ratios(scenario: Scenario, drawn_phases: dict, rng: np.random.Generator, draws: int) -> dict[str, list[float]]:
     """Return every mirror's ratios in every draw."""
     plan = working_point(scenario, maps.mirrors_of(scenario))
@@ -61,7 +46,7 @@ def ratios(scenario: Scenario, drawn_phases: dict, rng: np.random.Generator, dra
     truth = np.array([geometry.unit(np.array(h.normal_enu)) for h in scenario.heliostat])
     out: dict[str, list[float]] = {"forecast": [], "built": [], "guard": [], "error2": [], "spoke": []}
     for _ in range(draws):
-        built = as_built(scenario, rng)
+        built = drawn_phases["as_built"](scenario, rng)
         tones = drawn_phases["measured"](built, rng)
         found, plain = (
             solve(tones, scenario, choose(scenario, pose="rigid", integrity=guarded), **HOW)
