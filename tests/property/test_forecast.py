@@ -215,3 +215,14 @@ def test_surveys_that_are_off_by_what_they_say_raise_no_alarm(seed: int) -> None
         error2 += (np.sum((found.poses.normal_enu[0] - truth) ** 2, axis=1) / stated**2).tolist()
     assert np.mean(spoke) <= 0.05
     assert 0.75 < np.sqrt(np.mean(error2)) < 1.25
+
+
+@pytest.mark.parametrize("seed", [8, 16])
+def test_poses_are_found_where_the_direct_ray_leaves_all_in_false_minima(seed: int) -> None:
+    rng = np.random.default_rng([7, seed])
+    scenario = drawn(rng, ground="known", centre_hz=100e6)
+    found = solve(measured(scenario, rng), scenario, choose(scenario, pose="rigid"), sample_rate=Fraction(64_000_000),
+                  settings={"estimator": "correlator"})  # fmt: skip
+    assert found.integrity is not None
+    assert (found.poses.status == PoseStatus.OK).all()
+    assert (found.integrity.status == IntegrityStatus.OK).all()
