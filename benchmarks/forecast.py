@@ -4,9 +4,9 @@
 
 Scenarios are those of tests/property/test_forecast.py, with other seeds: tones, clocks, delays, surveys, mounts and
 ground drawn; surveys are off by what they say. Of each kind: the forecast over what is stated, mean, farthest from one
-and how many are over 3 % off, of the site as it is surveyed and of the site as it stands; what is stated with the guard
-over without it, mean and farthest; the errors' rms over what is stated, with its standard error; how often the guard left
-something out.
+and how many are over 3 % off, of the site as it is surveyed and of the site as it stands; what is stated with the
+guard over without it, mean and farthest; the errors' rms over what is stated, with its standard error; how often the
+guard left something out.
 """
 
 from __future__ import annotations

@@ -25,7 +25,15 @@ from rfpose.scenario import Scenario
 IntArray = npt.NDArray[np.int64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "carrier_sigma_rad", "mirror_groups", "mirror_problems", "noise_beside_survey"]
+__all__ = [
+    "MirrorGroup",
+    "RigidInputs",
+    "calibration_sight",
+    "carrier_sigma_rad",
+    "mirror_groups",
+    "mirror_problems",
+    "noise_beside_survey",
+]
 
 _VAGUE_RATIO = 100.0
 """A calibration off by so many times what the pivot is off by tells nothing of the pose."""

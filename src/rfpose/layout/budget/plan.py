@@ -107,17 +107,23 @@ class WorkingPoint:
 
         Where it knows a reflection, without what the calibration's survey adds: that is `survey_slope`.
         """
+        out = self.direct_sigma_m
+        if self.reflects and len(self.survey_sigma_m):
+            noise = self.calibration_weight * self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
+            out[: self.waves.n_tone] = np.sqrt((noise**2).sum(axis=0))
+        return out
+
+    @property
+    def direct_sigma_m(self) -> FloatArray:
+        """(group, transmitter) `transmitter_sigma_m` of a solver that knows no reflection: surveys are noise [m]."""
         out = np.full(self.waves.wavelength_m.shape, np.inf)
         noise = self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
-        tones = calibration_sigma_m(noise, self.survey_sigma_m)
-        if self.reflects and len(noise):
-            tones = np.sqrt(((self.calibration_weight * noise) ** 2).sum(axis=0))
-        out[: self.waves.n_tone] = tones
+        out[: self.waves.n_tone] = calibration_sigma_m(noise, self.survey_sigma_m)
         return out
 
     @property
     def survey_slope(self) -> FloatArray:
-        """(group, transmitter, draw) what unit draws of the calibration receivers' places do to calibrated ranges [m]."""
+        """(group, transmitter, draw) of calibrated ranges by unit draws of the calibration receivers' places [m]."""
         n = len(self.survey_sigma_m)
         root = np.einsum("cgta,c,cd->cgtda", self.calibration_by_place, self.survey_sigma_m, np.eye(n))
         out = np.zeros((*self.waves.wavelength_m.shape, 3 * n))
@@ -348,7 +354,9 @@ def _with_trusted_groups(plan: WorkingPoint) -> WorkingPoint:
     mirrors, transmitter = plan.mirrors, plan.scenario.transmitter_enu_m
     distance = _ranges(transmitter, mirrors.receiver_enu_m)[None, :, None]
     exact = np.repeat(distance, len(plan.waves.tone), axis=2)
-    solution = solve_ladder(plan.problem(exact, mirrors.pivot_enu_m[None]))
+    problem = plan.problem(exact, mirrors.pivot_enu_m[None])
+    common = np.broadcast_to(plan.direct_sigma_m, problem.transmitter_sigma_m.shape)
+    solution = solve_ladder(replace(problem, transmitter_sigma_m=common))
     kept: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=0))
     return replace(
         plan,

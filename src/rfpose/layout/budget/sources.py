@@ -180,7 +180,7 @@ class CalibrationSurvey:
         return f"{1e3 * plan.survey_sigma_m.max():.3g} mm in each axis" if np.any(plan.survey_sigma_m > 0.0) else ""
 
     def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
-        # its place is known with sigma in each axis; a solver that knows no reflection assumes that sigma for each range
+        # a solver that knows no reflection takes the sigma in each axis for one of each range by itself
         return [Effect(np.einsum("magrt,gtx->max", by_range, plan.survey_slope), common=True)]
 
     def disturb(self, world: DrawnSites) -> None:

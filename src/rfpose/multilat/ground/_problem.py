@@ -37,8 +37,8 @@ class CalibrationSight:
     place_enu_m : (calibration receiver, xyz)
         Where they are surveyed [m]; empty where there is no calibration.
     survey_sigma_m : (calibration receiver,)
-        How well, in each axis, as far as ``transmitter_sigma_m`` of what is solved does not count it [m]. None: exactly.
-        A receiver elsewhere sees another reflection, too, and all its ranges are off together.
+        How well, in each axis, as far as ``transmitter_sigma_m`` of what is solved does not count it [m]; None:
+        exactly. A receiver elsewhere sees another reflection, too, and all its ranges are off together.
     frame : (mirror,)
         Frame of each mirror. None: all of one.
     change_m
@@ -63,7 +63,7 @@ class CalibrationSight:
         return cls(place_enu_m=as_float_array("calibration_enu_m", sight, ("calibration receiver", 3)))
 
     def by_survey(self, slope: FloatArray) -> FloatArray:
-        """Derivatives of each receiver's ranges by the three axes of every receiver that is not surveyed exactly.
+        """Return derivatives of receivers' ranges by the three axes of every receiver that is not surveyed exactly.
 
         Parameters
         ----------
@@ -182,7 +182,8 @@ class GroundProblem:
     def begin(self, pivot: FloatArray, rot: FloatArray, status: IntArray) -> RigidFits:
         """Return mirrors from which to begin, with the clocks that fit them best."""
         n_cov = 6 + self.mirrors.prior.clock[0].size
-        return begin(self.mirrors, pivot, rot, status, n_cov=n_cov, n_survey=self.n_survey, n_parameter=self.n_parameter)
+        counts = {"n_cov": n_cov, "n_survey": self.n_survey, "n_parameter": self.n_parameter}
+        return begin(self.mirrors, pivot, rot, status, **counts)
 
     def fit(
         self,
@@ -206,9 +207,8 @@ class GroundProblem:
         """Leave all reflections out."""
         if self.n_survey:  # which count still
             n_plane = len(self.scene.coefficient)
-            dark = self.scene._replace(
-                coefficient=np.zeros(n_plane, np.complex128), column=np.full(n_plane, -1), common=self.scene.common[..., :1]
-            )
+            none, given = np.zeros(n_plane, np.complex128), np.full(n_plane, -1, np.int64)
+            dark = self.scene._replace(coefficient=none, column=given, common=self.scene.common[..., :1].copy())
             return replace(self, scene=dark)
         return replace(
             self,

@@ -39,7 +39,7 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 _TURN_RAD, _N_TURN = 0.4, 200
-"""How far a mirror that does not fit is turned at most to start again; points in a cube, of which half lie in the ball."""
+"""How far a mirror that does not fit is turned at most to start again; points in a cube, half of them in the ball."""
 _FAR_TURN_RAD, _N_FAR_TURN = 0.8, 400
 """The same where coefficients are known: no other mirror need fit, and the direct ray's pose may be a radian off."""
 _MAX_ITERATION_DIRECT = 12

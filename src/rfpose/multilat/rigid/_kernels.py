@@ -43,8 +43,8 @@ class RigidFits(NamedTuple):
 
     ``survey`` (mirror, 3 × calibration receiver): how far these are from where they are surveyed, in standard
     deviations, as this mirror has it. ``cov`` of the first unknowns (pose, then clocks, then survey) is at given
-    coefficients; ``follow`` (mirror, unknown, parameter) is how the unknowns move with these, ``schur`` and ``rest`` the
-    information and gradient left for them.
+    coefficients; ``follow`` (mirror, unknown, parameter) is how the unknowns move with these, ``schur`` and ``rest``
+    the information and gradient left for them.
     """
 
     pivot: Float64
@@ -397,9 +397,7 @@ def covariance_many(begin, end, scene, mirrors, floor, pivot, rot, clock, cov):
         predicted = np.empty((1, n_receiver, n_transmitter))
         slope = np.empty((1, n_receiver, n_transmitter, 6))
         info, unused = np.empty((n, n)), np.empty(n)
-        predict(
-            scene, scene.common[0], work, mirrors.receiver_mirror[m], pivot[m], rot[m], surveyed, predicted, slope
-        )
+        predict(scene, scene.common[0], work, mirrors.receiver_mirror[m], pivot[m], rot[m], surveyed, predicted, slope)
         normal_equations(
             mirrors.z[m], mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock[m],
             info, unused,
