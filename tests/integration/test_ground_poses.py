@@ -15,11 +15,13 @@ from rfpose import geometry
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat import PoseStatus
 from rfpose.multilat.ground import (
+    CalibrationSight,
     Reflector,
     Surface,
     fresnel_coefficient,
     ground_bound,
     guard_with_ground,
+    range_shift_m,
     solve_with_ground,
 )
 from rfpose.multilat.integrity import Alarms, IntegrityStatus, TransmitterStatus
@@ -364,3 +366,64 @@ def test_the_bound_with_estimated_coefficients_is_the_solutions_covariance(calib
     )
     stated = tilt_sigma_rad(solution.full_cov[:, :6, :6], field.rot_true[:, :, 2])
     np.testing.assert_allclose(stated, tilt_sigma_rad(cov[:, :6, :6], field.rot_true[:, :, 2]), rtol=0.02)
+
+
+def test_calibration_receivers_that_stand_elsewhere_count_as_places():
+    """Brute force: finite differences of distance and shift, the whole covariance of all ranges inverted at once."""
+    field = make_field(4, 3, 100e6, -0.3 + 0.1j)
+    calibration, survey_m = np.array([[15.0, -20.0, 2.5], [-40.0, 30.0, 3.0]]), np.array([0.0, 0.004])
+    sigma_m, common_m, n_tone, n_range = 3e-3, 2e-3, len(TONE_HZ), 30
+    reflector = Reflector(coefficient=-0.3 + 0.1j)
+    cov = ground_bound(
+        MirrorProblem.expected(
+            TRANSMITTER,
+            PLACES,
+            field.pivot_true,
+            field.rot_true,
+            sigma_m=np.full((3, n_tone, 3, 10), sigma_m),
+            transmitter_sigma_m=np.full((3, n_tone, 10), common_m),
+            clock_class=[0, 1],
+            knowledge=replace(field.knowledge, clock_sigma_m=np.inf),
+        ),
+        carrier_rf_hz=field.carrier_rf_hz,
+        tone_hz=TONE_HZ,
+        reflectors=[reflector],
+        coefficient=[-0.3 + 0.1j],
+        calibration_enu_m=CalibrationSight(place_enu_m=calibration, survey_sigma_m=survey_m),
+    )
+
+    def seen(points):
+        shift = range_shift_m(
+            TRANSMITTER, points, reflectors=[reflector], carrier_rf_hz=field.carrier_rf_hz, tone_hz=TONE_HZ
+        )
+        distance = np.linalg.norm(points[:, None] - TRANSMITTER, axis=-1)
+        return np.moveaxis(distance[..., None] + shift, -1, 0)
+
+    def ranges(m, turn, move, off):
+        rot = Rotation.from_rotvec(turn).as_matrix() @ field.rot_true[m]
+        there = calibration + np.array([np.zeros(3), off])
+        return (seen(field.pivot_true[m] + move + PLACES @ rot.T) - seen(there).mean(axis=1)[:, None]).ravel()
+
+    same = np.kron(np.eye(n_tone), np.kron(np.ones((3, 3)), np.eye(10)))
+    noise = sigma_m**2 * np.eye(n_tone * n_range) + common_m**2 * same
+    clocks = np.kron(np.eye(3 * n_tone), np.ones((10, 1)))
+    for m in range(3):
+        columns = []
+        for step in np.eye(9) * 1e-5:
+            up, down = (ranges(m, sign * step[3:6], sign * step[:3], sign * step[6:]) for sign in (1.0, -1.0))
+            columns.append((up - down) / 2e-5)
+        slope, elsewhere = np.stack(columns[:6], axis=1), survey_m[1] * np.stack(columns[6:], axis=1)
+        slope = np.concatenate([slope, clocks], axis=1)
+        info = slope.T @ np.linalg.solve(noise + elsewhere @ elsewhere.T, slope)
+        info[:3, :3] += np.eye(3) / field.knowledge.pivot_sigma_m**2
+        expected = np.linalg.inv(info)[:6, :6]
+        size = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(cov[m, :6, :6] / np.outer(size, size), expected / np.outer(size, size), atol=1e-4)
+
+
+def test_known_coefficients_need_no_mirror_that_fits_already():
+    for seed in (0, 4):
+        field = make_field(seed, 6, 100e6, -0.3 + 0.1j, off_rad=1.0)
+        solution = field.solve(reflectors=[Reflector(coefficient=-0.3 + 0.1j)])
+        assert (solution.status == PoseStatus.OK).all()
+        assert_scatter_is_as_stated(field, solution)

@@ -113,7 +113,11 @@ def test_loss_and_move_are_those_of_the_map(mirrors):
 
 
 def test_single_receivers_know_no_reflection(mirrors):
-    none = ReflectionBend(place_slope=np.zeros((300, 1, 3, 10, 3)), shared_slope=np.zeros((300, 1, 3, 10, 0)))
+    none = ReflectionBend(
+        place_slope=np.zeros((300, 1, 3, 10, 3)),
+        shared_slope=np.zeros((300, 1, 3, 10, 0)),
+        survey_slope=np.zeros((1, 10, 0)),
+    )
     with pytest.raises(InvalidInputError, match="rigid"):
         normal_gain(
             TRANSMITTER, mirrors, np.ones((300, 1, 3, 10)), np.zeros((1, 10)), [0], ESTIMATORS["independent"],

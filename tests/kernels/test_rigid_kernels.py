@@ -18,7 +18,7 @@ PIVOT, ROT = np.array([5.0, -20.0, 2.0]), rot_enu_from_mirror([0.2, 0.7, 0.6])
 def ranges(pivot, rot):
     distance, slope = np.empty((1, 3, 7)), np.empty((1, 3, 7, 6))
     scene = direct_rays(TRANSMITTER, 1)
-    _kernels.predict(scene, scene.common[0], work_for(0), PLACES, pivot, rot, distance, slope)
+    _kernels.predict(scene, scene.common[0], work_for(0), PLACES, pivot, rot, np.empty(0), distance, slope)
     return distance[0], slope[0]
 
 

@@ -150,6 +150,21 @@ def measured(scenario: Scenario, rng: np.random.Generator) -> TonePhases:
     return tones
 
 
+def as_built(scenario: Scenario, rng: np.random.Generator) -> Scenario:
+    """Return the site as it is: what was surveyed lies elsewhere, by what surveys are off."""
+
+    def off(place_m: tuple[float, ...], sigma_m: float | None) -> list[float]:
+        return (np.array(place_m) + rng.normal(0.0, 1.0, 3) * (sigma_m or 0.0)).tolist()
+
+    return scenario.changed(
+        heliostat=[{**h.model_dump(), "pivot_enu_m": off(h.pivot_enu_m, h.pivot_sigma_m)} for h in scenario.heliostat],
+        calibration_receiver=[
+            {**c.model_dump(), "position_enu_m": off(c.position_enu_m, c.survey_sigma_m)}
+            for c in scenario.calibration_receiver
+        ],
+    )
+
+
 CASES = [("none", 100e6, k) for k in range(6)] + [("none", 0.0, k) for k in range(2)]
 CASES += [(ground, 100e6, k) for ground in ("known", "estimated") for k in range(3)]
 
@@ -176,3 +191,38 @@ def test_the_forecast_is_what_process_states(ground: str, centre_hz: float, seed
         stated = solve(tones, scenario, choose(scenario, pose="independent"), **how).poses.sigma_rad[0]
         np.testing.assert_allclose(maps.study_of(scenario, "independent").bound(mirrors), stated, rtol=0.05)
         np.testing.assert_allclose(noise_bound(working_point(scenario, mirrors, pose="independent")), stated, rtol=0.05)
+
+
+@pytest.mark.parametrize("seed", [7, 12, 15])
+def test_surveys_that_are_off_by_what_they_say_raise_no_alarm(seed: int) -> None:
+    """With a known ground: what a calibration receiver sees of it depends on where that truly stands."""
+    rng = np.random.default_rng([7, seed])
+    scenario = drawn(rng, ground="known", centre_hz=100e6)
+    truth = np.array([geometry.unit(np.array(h.normal_enu)) for h in scenario.heliostat])
+    assert all(c.survey_sigma_m > 0.0 for c in scenario.calibration_receiver)
+    spoke, error2 = [], []
+    for _ in range(15):
+        built = as_built(scenario, rng)
+        tones = measured(built, rng)
+        found = solve(tones, scenario, choose(scenario, pose="rigid"), sample_rate=Fraction(64_000_000),
+                      settings={"estimator": "correlator"})  # fmt: skip
+        assert found.integrity is not None
+        assert (found.poses.status == PoseStatus.OK).all()
+        spoke += (found.integrity.status[0] != IntegrityStatus.OK).tolist()
+        stated = found.poses.sigma_rad[0]
+        # of the site as it stands: with the ground, sigma itself depends on the place within millimetres
+        np.testing.assert_allclose(noise_bound(working_point(built, maps.mirrors_of(built))), stated, rtol=0.02)
+        error2 += (np.sum((found.poses.normal_enu[0] - truth) ** 2, axis=1) / stated**2).tolist()
+    assert np.mean(spoke) <= 0.05
+    assert 0.75 < np.sqrt(np.mean(error2)) < 1.25
+
+
+@pytest.mark.parametrize("seed", [8, 16])
+def test_poses_are_found_where_the_direct_ray_leaves_all_in_false_minima(seed: int) -> None:
+    rng = np.random.default_rng([7, seed])
+    scenario = drawn(rng, ground="known", centre_hz=100e6)
+    found = solve(measured(scenario, rng), scenario, choose(scenario, pose="rigid"), sample_rate=Fraction(64_000_000),
+                  settings={"estimator": "correlator"})  # fmt: skip
+    assert found.integrity is not None
+    assert (found.poses.status == PoseStatus.OK).all()
+    assert (found.integrity.status == IntegrityStatus.OK).all()

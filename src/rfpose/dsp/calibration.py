@@ -123,7 +123,10 @@ def average_phases(
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(np.isfinite(phi) & np.isfinite(variance), 1.0 / variance, 0.0)
     return PhaseAverage(
-        phi_rad=np.where(weight > 0.0, phi, 0.0), weight=np.where(_joined(weight), weight, 0.0), time_s=None
+        phi_rad=np.where(weight > 0.0, phi, 0.0),
+        weight=np.where(_joined(weight), weight, 0.0),
+        survey_rad=survey[:, None] * wavenumber,
+        time_s=None,
     )
 
 
@@ -140,12 +143,15 @@ class PhaseAverage:
         Phase and range [rad], on the receiver's own clock.
     weight : (frame, calibration receiver, transmitter, tone)
         1/σ²; 0 = not seen, or by a receiver that shares no transmitter with the rest.
+    survey_rad : (calibration receiver, tone)
+        Share of σ that its place is uncertain by [rad].
     time_s : (frame,)
         For frames in which a transmitter was not measured [s]; None: frames follow each other evenly.
     """
 
     phi_rad: FloatArray
     weight: FloatArray
+    survey_rad: FloatArray
     time_s: FloatArray | None
 
     @property
@@ -154,6 +160,15 @@ class PhaseAverage:
         total = self.weight.sum(axis=1)
         with np.errstate(divide="ignore"):
             return np.where(total > 0.0, 1.0 / np.sqrt(total), np.nan)
+
+    @property
+    def noise_rad(self) -> FloatArray:
+        """(frame, transmitter, tone) what of `sigma_rad` is left where all receivers are as surveyed."""
+        total, square = self.weight.sum(axis=1), self.survey_rad[:, None] ** 2
+        # Σ (w/Σw)² (1/w − survey²)
+        noise = (self.weight * np.maximum(1.0 - self.weight * square, 0.0)).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(total > 0.0, np.sqrt(noise) / total, np.nan)
 
     @property
     def phase_rad(self) -> FloatArray:

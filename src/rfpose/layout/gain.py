@@ -6,7 +6,7 @@ survey does, need the estimator: the derivative of the solved normal by every ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -65,10 +65,13 @@ class ReflectionBend:
         What a receiver's place adds to the range besides the direct ray's direction.
     shared_slope : (mirror, group, receiver, transmitter, shared)
         By real and imaginary part of each coefficient that is estimated [m]; no columns where all are known.
+    survey_slope : (group, transmitter, draw)
+        By what is known to one standard deviation besides: coordinates of the calibration receivers [m].
     """
 
     place_slope: FloatArray
     shared_slope: FloatArray
+    survey_slope: FloatArray
 
 
 def gain_of(transmitter_enu_m: npt.ArrayLike, mirrors: PosedMirrors, noise: Noise, estimator: Estimator) -> Gain:
@@ -150,7 +153,9 @@ def normal_gain(
             continue
         bent = None
         if reflection is not None:
-            bent = ReflectionBend(place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows])
+            bent = replace(
+                reflection, place_slope=reflection.place_slope[rows], shared_slope=reflection.shared_slope[rows]
+            )
         parts.append(_rigid(transmitter, part, sigma[rows], common, classes, estimator, bent))
     range_slope, pivot_slope, cov, shared_slope, by_range, by_pivot, schur = (
         np.concatenate(arrays) for arrays in zip(*parts, strict=True)
@@ -230,18 +235,20 @@ def _rigid(
     n_mirror, n_group, n_receiver, n_transmitter = sigma.shape
     rot = mirrors.rot_enu_from_mirror
     direction = np.broadcast_to(_directions(transmitter, mirrors)[:, None], (*sigma.shape, 3))
-    n_shared = 0
+    n_shared = n_survey = 0
     if reflection is not None:
         direction = direction + reflection.place_slope
-        n_shared = reflection.shared_slope.shape[-1]
+        n_shared, n_survey = reflection.shared_slope.shape[-1], reflection.survey_slope.shape[-1]
     arm = mirrors.receiver_enu_m - mirrors.pivot_enu_m[:, None]
     clock = _clock_columns(classes, n_receiver, shared=estimator.clock_sigma_m == 0.0)
-    n_pose = 6 + clock.shape[-1]
+    n_known = 6 + clock.shape[-1]
+    n_pose = n_known + n_survey
     rows = np.zeros((*sigma.shape, n_pose + n_shared))
     rows[..., :3] = direction
     rows[..., 3:6] = np.cross(arm[:, None, :, None], direction)
-    rows[..., 6:n_pose] = clock[None, :, :, None]
+    rows[..., 6:n_known] = clock[None, :, :, None]
     if reflection is not None:
+        rows[..., n_known:n_pose] = reflection.survey_slope[None, :, None]
         rows[..., n_pose:] = reflection.shared_slope
     weight = sigma**-2.0
     with np.errstate(divide="ignore"):
@@ -250,7 +257,8 @@ def _rigid(
     mean = np.einsum("mgrt,mgrtk->mgtk", weight, rows) / np.where(total > 0.0, total, 1.0)[..., None]
     weighed = weight[..., None] * (rows - mean[:, :, None])
     info = np.einsum("mgrtk,mgrtl->mkl", rows, weighed)
-    info[:, :n_pose, :n_pose] += _prior(estimator, rot, weight, bias_info, classes)
+    info[:, :n_known, :n_known] += _prior(estimator, rot, weight, bias_info, classes)
+    info[:, n_known:n_pose, n_known:n_pose] += np.eye(n_survey)
     flat = weighed.reshape(n_mirror, -1, n_pose + n_shared)
     pose = _inverse(info[:, :n_pose, :n_pose])
     to_normal = np.zeros((n_mirror, 2, n_pose))

@@ -16,7 +16,7 @@ from rfpose.multilat.ground import ground_bound
 from rfpose.multilat.rigid import MirrorProblem, full_covariance, part_of, tilt_sigma_rad
 from rfpose.multilat.rigid.delays import learn_delays
 from rfpose.pipeline.choice import PoseChoice
-from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, mirror_groups
+from rfpose.pipeline.mirrors import MirrorGroup, calibration_sight, mirror_groups, noise_beside_survey
 from rfpose.pipeline.noise import PhaseNoise
 from rfpose.scenario import Scenario
 
@@ -99,6 +99,11 @@ def _rigid(
     """Covariance of pose and clocks of a group's mirrors, first axis frame × heliostat."""
     n_frame = len(noise.tone_rad)
     calibration = noise.calibration_rad if scenario.is_calibrated else None
+    average, surveyed = None, noise.source == "result"  # in a simulation everything is where it is surveyed
+    if choice.reflection != "none":
+        average = phase_average(np.where(np.isfinite(noise.tone_rad), 0.0, np.nan), noise.tone_rad, scenario)
+        if surveyed:
+            calibration = noise_beside_survey(average, noise.calibration_rad)
     sigma, common = group.range_noise(noise.tone_rad, noise.carrier_rad, calibration)
     mirrors = MirrorProblem.expected(
         scenario.transmitter_enu_m,
@@ -110,13 +115,12 @@ def _rigid(
         clock_class=group.waves.clock_class,
         knowledge=group.knowledge(n_frame),
     )
-    if choice.reflection == "none":
+    if average is None:
         return full_covariance(mirrors)
     reflectors = reflectors_of(scenario, choice.reflection)
     truth = np.zeros(len(reflectors), np.complex128) if coefficient is None else np.asarray(coefficient)
     n_helio = len(group.column)
     row = np.arange(len(rot)).reshape(n_frame, -1)
-    average = phase_average(np.where(np.isfinite(noise.tone_rad), 0.0, np.nan), noise.tone_rad, scenario)
     shared = {"recording": [row.ravel()], "frame": list(row), "mirror": list(row.T)}[scenario.reflection.shared]
     out = np.full((len(rot), *2 * (6 + sigma.shape[1] * sigma.shape[2],)), np.nan)
     for rows in shared:
@@ -126,7 +130,7 @@ def _rigid(
             tone_hz=group.waves.tone_hz,
             reflectors=reflectors,
             coefficient=[complex(c) for c in truth],
-            calibration_enu_m=calibration_sight(average, scenario, rows // n_helio),
+            calibration_enu_m=calibration_sight(average, scenario, rows // n_helio, surveyed=surveyed),
             free_space=scenario.reflection.spreading == "free_space",
             propagation_speed_mps=scenario.radio.propagation_speed_mps,
         )

@@ -25,7 +25,15 @@ from rfpose.scenario import Scenario
 IntArray = npt.NDArray[np.int64]
 _Number = TypeVar("_Number", bound=np.generic)
 
-__all__ = ["MirrorGroup", "RigidInputs", "calibration_sight", "carrier_sigma_rad", "mirror_groups", "mirror_problems"]
+__all__ = [
+    "MirrorGroup",
+    "RigidInputs",
+    "calibration_sight",
+    "carrier_sigma_rad",
+    "mirror_groups",
+    "mirror_problems",
+    "noise_beside_survey",
+]
 
 _VAGUE_RATIO = 100.0
 """A calibration off by so many times what the pivot is off by tells nothing of the pose."""
@@ -97,7 +105,17 @@ class MirrorGroup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RigidInputs:
-    """What the stages before found, and how to go on."""
+    """What the stages before found, and how to go on.
+
+    Attributes
+    ----------
+    tones, calibration, ranges, fixes
+        See `rfpose.pipeline.rigid.solve_rigid_poses`.
+    scenario, choice
+        The site, and the estimator.
+    average
+        How the calibration became of its receivers, where a reflection they see as well is in the model.
+    """
 
     tones: TonePhases
     calibration: PhaseCalibration
@@ -105,6 +123,7 @@ class RigidInputs:
     fixes: FixTable
     scenario: Scenario
     choice: PoseChoice
+    average: PhaseAverage | None
 
     @property
     def n_frame(self) -> int:
@@ -171,9 +190,10 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
     """
     tones, calibration = inputs.tones, inputs.calibration
     calibrated = inputs.scenario.is_calibrated
-    sigma, common = group.range_noise(
-        tones.sigma_rad, carrier_sigma_rad(tones), calibration.sigma_rad if calibrated else None
-    )
+    sigma_rad = calibration.sigma_rad if calibrated else None
+    if inputs.average is not None:
+        sigma_rad = noise_beside_survey(inputs.average, calibration.sigma_rad)
+    sigma, common = group.range_noise(tones.sigma_rad, carrier_sigma_rad(tones), sigma_rad)
     out = []
     for k, q in enumerate(group.waves.tone):
         wavelength = group.waves.wavelength_m[k]
@@ -198,6 +218,19 @@ def _observations(inputs: RigidInputs, group: MirrorGroup) -> list[Observation]:
             )
         )
     return out
+
+
+def noise_beside_survey(average: PhaseAverage, sigma_rad: FloatArray) -> FloatArray:
+    """Return the electronic phases' noise where `calibration_sight` counts how well their receivers are surveyed.
+
+    Parameters
+    ----------
+    average
+    sigma_rad : (frame, transmitter, tone)
+        With the survey [rad]; stays where a frame has no measurement of its own.
+    """
+    noise = average.noise_rad
+    return np.where(np.isfinite(noise), noise, sigma_rad)
 
 
 def carrier_sigma_rad(tones: TonePhases) -> FloatArray:
@@ -282,8 +315,10 @@ def _are_vague(inputs: RigidInputs, group: MirrorGroup, places: FloatArray) -> n
     return np.asarray(~(np.sqrt(variance) < width[:, None]).all(axis=1))
 
 
-def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDArray[np.int64]) -> CalibrationSight:
-    """Return how the calibration receivers' reflections get into ranges.
+def calibration_sight(
+    average: PhaseAverage, scenario: Scenario, frame: npt.NDArray[np.int64], *, surveyed: bool = True
+) -> CalibrationSight:
+    """Return how the calibration receivers' reflections and places get into ranges.
 
     Parameters
     ----------
@@ -292,6 +327,9 @@ def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDAr
     scenario
     frame : (mirror,)
         Of each mirror that is to be solved.
+    surveyed
+        Count how well their places are known, which noise then must not hold (`noise_beside_survey`); else they are
+        exact.
     """
     order = wavelengths_of(scenario).tone
     per_m = (2.0 * np.pi / scenario.wavelength_m)[:, None]
@@ -302,4 +340,7 @@ def calibration_sight(average: PhaseAverage, scenario: Scenario, frame: npt.NDAr
         # a longer path turns a phase back: Φ without the shifts is what receivers' phases turned forward give
         return (average.change_rad(per_m * shift, frames) / per_m)[:, :, order]
 
-    return CalibrationSight(place_enu_m=scenario.calibration_enu_m, frame=frame, change_m=change_m)
+    sigma = np.array([r.survey_sigma_m if surveyed else 0.0 for r in scenario.calibration_receiver])
+    return CalibrationSight(
+        place_enu_m=scenario.calibration_enu_m, survey_sigma_m=sigma, frame=frame, change_m=change_m
+    )

@@ -99,8 +99,17 @@ def solve_rigid_poses(
     memory
         Of the frames before these; it takes these in.
     """
+    average = None
+    if choice.reflection != "none":
+        average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
     inputs = RigidInputs(
-        tones=tones, calibration=calibration, ranges=ranges, fixes=fixes, scenario=scenario, choice=choice
+        tones=tones,
+        calibration=calibration,
+        ranges=ranges,
+        fixes=fixes,
+        scenario=scenario,
+        choice=choice,
+        average=average,
     )
     tables = _Tables(inputs, independent)
     start = tones.frame_start_index
@@ -130,16 +139,15 @@ def _solved(
 ) -> PoseEstimates:
     """Solve one group of mirrors by the chosen estimator."""
     alarms = _alarms(inputs)
-    if inputs.choice.reflection == "none":
+    if inputs.average is None:
         return solve_direct(problem, alarms, again)
-    scenario, tones = inputs.scenario, inputs.tones
+    scenario = inputs.scenario
     row = np.arange(len(problem.range_m)).reshape(inputs.n_frame, -1)
     frame, heliostat = (index.ravel() for index in np.indices(row.shape))
-    average = phase_average(tones.phase_rad, tones.sigma_rad, scenario, frame_times(tones, scenario))
     reflections = ReflectionModel(
         reflectors=reflectors_of(scenario, inputs.choice.reflection),
         carrier_rf_hz=scenario.carrier_rf_hz,
-        calibration=calibration_sight(average, scenario, frame),
+        calibration=calibration_sight(inputs.average, scenario, frame),
         free_space=scenario.reflection.spreading == "free_space",
         propagation_speed_mps=scenario.radio.propagation_speed_mps,
     )

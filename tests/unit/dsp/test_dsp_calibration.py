@@ -182,3 +182,22 @@ def test_wrong_shapes_are_refused():
             transmitter_enu_m=TRANSMITTER,
             wavelength_m=WAVELENGTH,
         )
+
+
+def test_sigma_is_noise_and_survey():
+    rng = np.random.default_rng(5)
+    survey_m = np.array([0.0, 0.002, 0.01])
+    sigma = rng.uniform(1e-5, 1e-3, (2, 3, 6, 2))
+    found = average_phases(
+        np.zeros(sigma.shape),
+        sigma,
+        calibration_enu_m=np.zeros((3, 3)),
+        transmitter_enu_m=TRANSMITTER,
+        wavelength_m=WAVELENGTH,
+        survey_sigma_m=survey_m,
+    )
+    share = found.weight / found.weight.sum(axis=1, keepdims=True)
+    survey = 2.0 * np.pi / WAVELENGTH * survey_m[:, None]
+    np.testing.assert_allclose(found.noise_rad, np.sqrt((share**2 * sigma**2).sum(axis=1)), rtol=1e-9)
+    both = found.noise_rad**2 + (share**2 * survey[:, None] ** 2).sum(axis=1)
+    np.testing.assert_allclose(found.sigma_rad, np.sqrt(both), rtol=1e-9)

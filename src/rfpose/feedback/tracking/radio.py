@@ -17,7 +17,7 @@ from rfpose import geometry
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
 from rfpose.measurement import estimator_of, noise_of, simulated_ground, wavelengths_of
-from rfpose.multilat.ground import solve_with_ground
+from rfpose.multilat.ground import CalibrationSight, solve_with_ground
 from rfpose.multilat.ground.model import range_shift_m
 from rfpose.multilat.rigid import MirrorProblem, Observation, part_of, rigid_bound
 from rfpose.multilat.transmitters import check_transmitters
@@ -172,14 +172,13 @@ class RadioByPosture:
         nearest = KDTree(self._pivot[sample]).query(self._pivot)[1]
         return sample, np.asarray(nearest, np.int64)
 
-    def _observations(self, pivot: FloatArray, rot: FloatArray) -> list[Observation]:
-        """Ranges of mirrors over the reflecting ground, without noise."""
+    def _observations(self, pivot: FloatArray, rot: FloatArray, common: FloatArray) -> list[Observation]:
+        """Ranges of mirrors over the reflecting ground, without noise; ``common`` sigma of Φ (group, transmitter)."""
         scenario, ground, waves = self._scenario, self._scenario.simulation.ground, self._waves
         assert ground is not None
         mirror = simulated_ground(scenario, coefficient=complex(*ground.coefficient))
         receiver = (pivot[:, None] + np.einsum("mab,rb->mra", rot, self._places)).reshape(-1, 3)
         distance = np.linalg.norm(receiver[:, None] - scenario.transmitter_enu_m, axis=-1)
-        common = self._common_m
 
         def shift(points: FloatArray) -> FloatArray:
             return range_shift_m(
@@ -209,14 +208,30 @@ class RadioByPosture:
             for g in range(len(waves.tone))
         ]
 
+    def _noise_beside_survey_m(self) -> FloatArray:
+        """(group, transmitter) sigma of Φ where the calibration receivers are exactly where they are surveyed [m]."""
+        exact = [c.changed(survey_sigma_m=0.0) for c in self._scenario.calibration_receiver]
+        scenario = self._scenario.changed(calibration_receiver=exact)
+        noise = noise_of(scenario, tone_snr_db=scenario.tracking.radio.tone_snr_db)
+        return noise.groups(carrier=self._estimator.carrier)[1]
+
     def _solve(self, rot: FloatArray, *, estimate: bool) -> tuple[FloatArray, FloatArray]:
         """Return normals and rotation covariances of the sampled mirrors by the solver itself."""
         sample = self._nearest[0]
         pivot, rot = self._pivot[sample], rot[sample]
+        scenario, sight, common = self._scenario, None, self._common_m
+        if scenario.calibration_receiver:
+            surveyed = CalibrationSight(
+                place_enu_m=scenario.calibration_enu_m,
+                survey_sigma_m=np.array([c.survey_sigma_m for c in scenario.calibration_receiver]),
+            )
+            # a solver that knows of the reflection counts the survey as places, not as noise of each range
+            sight = surveyed if estimate else scenario.calibration_enu_m
+            common = self._noise_beside_survey_m() if estimate else common
         mirrors = MirrorProblem.of_observations(
             self._scenario.transmitter_enu_m,
             self._places,
-            self._observations(pivot, rot),
+            self._observations(pivot, rot, common),
             start_pivot_enu_m=pivot,
             start_rot_enu_from_mirror=rot,
             knowledge=replace(self._estimator, pivot_enu_m=pivot),
@@ -225,7 +240,7 @@ class RadioByPosture:
             mirrors,
             carrier_rf_hz=self._scenario.carrier_rf_hz,
             reflectors=(simulated_ground(self._scenario),) if estimate else (),
-            calibration_enu_m=self._scenario.calibration_enu_m if self._scenario.calibration_receiver else None,
+            calibration_enu_m=sight,
             free_space=self._spreads(),
             propagation_speed_mps=self._scenario.radio.propagation_speed_mps,
             min_probability=0.0,

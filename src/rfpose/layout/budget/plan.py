@@ -103,11 +103,36 @@ class WorkingPoint:
 
     @property
     def transmitter_sigma_m(self) -> FloatArray:
-        """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m]."""
+        """(group, transmitter) error common to all receivers that the solver assumes; infinity: uncalibrated [m].
+
+        Where it knows a reflection, without what the calibration's survey adds: that is `survey_slope`.
+        """
+        out = self.direct_sigma_m
+        if self.reflects and len(self.survey_sigma_m):
+            noise = self.calibration_weight * self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
+            out[: self.waves.n_tone] = np.sqrt((noise**2).sum(axis=0))
+        return out
+
+    @property
+    def direct_sigma_m(self) -> FloatArray:
+        """(group, transmitter) `transmitter_sigma_m` of a solver that knows no reflection: surveys are noise [m]."""
         out = np.full(self.waves.wavelength_m.shape, np.inf)
         noise = self.calibration_thermal_m * np.sqrt(1.0 + self.converter_share)
         out[: self.waves.n_tone] = calibration_sigma_m(noise, self.survey_sigma_m)
         return out
+
+    @property
+    def survey_slope(self) -> FloatArray:
+        """(group, transmitter, draw) of calibrated ranges by unit draws of the calibration receivers' places [m]."""
+        n = len(self.survey_sigma_m)
+        root = np.einsum("cgta,c,cd->cgtda", self.calibration_by_place, self.survey_sigma_m, np.eye(n))
+        out = np.zeros((*self.waves.wavelength_m.shape, 3 * n))
+        out[: self.waves.n_tone] = -self.calibration_mean(root.reshape(*root.shape[:3], 3 * n))
+        return out
+
+    def calibration_mean(self, range_m: FloatArray) -> FloatArray:
+        """(tone, transmitter, …) what ranges of the calibration receivers (…, tone, transmitter, …) come to [m]."""
+        return np.asarray(np.einsum("cgt,cgt...->gt...", self.calibration_weight, range_m))
 
     @property
     def reflects(self) -> bool:
@@ -145,8 +170,7 @@ class WorkingPoint:
         shift = np.moveaxis(self.shift_m(transmitter, self.mirrors.receiver_enu_m, reflector), -1, 1)
         if self.scenario.calibration_receiver:
             there = self.shift_m(transmitter, self.scenario.calibration_enu_m, reflector, tones_only=True)
-            mean = np.einsum("ctg,cgt->gt", there, self.calibration_weight)
-            shift[:, : self.waves.n_tone] -= mean[:, None]
+            shift[:, : self.waves.n_tone] -= self.calibration_mean(np.swapaxes(there, 1, 2))[:, None]
         return shift
 
     @property
@@ -185,7 +209,9 @@ class WorkingPoint:
         if self.reflects:
             direct = _directions(self.scenario.transmitter_enu_m, self.mirrors.receiver_enu_m)
             reflection = ReflectionBend(
-                place_slope=self.by_place - direct[:, None], shared_slope=self._coefficient_slope()
+                place_slope=self.by_place - direct[:, None],
+                shared_slope=self._coefficient_slope(),
+                survey_slope=self.survey_slope,
             )
         return normal_gain(
             self.scenario.transmitter_enu_m,
@@ -328,7 +354,9 @@ def _with_trusted_groups(plan: WorkingPoint) -> WorkingPoint:
     mirrors, transmitter = plan.mirrors, plan.scenario.transmitter_enu_m
     distance = _ranges(transmitter, mirrors.receiver_enu_m)[None, :, None]
     exact = np.repeat(distance, len(plan.waves.tone), axis=2)
-    solution = solve_ladder(plan.problem(exact, mirrors.pivot_enu_m[None]))
+    problem = plan.problem(exact, mirrors.pivot_enu_m[None])
+    common = np.broadcast_to(plan.direct_sigma_m, problem.transmitter_sigma_m.shape)
+    solution = solve_ladder(replace(problem, transmitter_sigma_m=common))
     kept: npt.NDArray[np.bool_] = np.asarray(solution.fixed.all(axis=0))
     return replace(
         plan,

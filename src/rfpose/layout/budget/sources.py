@@ -73,8 +73,7 @@ def _calibrated(plan: WorkingPoint) -> bool:
 def _of_calibration(plan: WorkingPoint, by_range: FloatArray, root_m: FloatArray) -> Effect:
     """Errors of calibration phases: ``root_m`` (calibration receiver, tone, transmitter, draw) in ranges there [m]."""
     through = by_range[:, :, : plan.waves.n_tone].sum(axis=3)
-    slope = -np.einsum("magt,cgt,cgtx->max", through, plan.calibration_weight, root_m)
-    return Effect(slope, common=True)
+    return Effect(-np.einsum("magt,gtx->max", through, plan.calibration_mean(root_m)), common=True)
 
 
 def _diagonal(sigma_m: FloatArray) -> FloatArray:
@@ -181,10 +180,8 @@ class CalibrationSurvey:
         return f"{1e3 * plan.survey_sigma_m.max():.3g} mm in each axis" if np.any(plan.survey_sigma_m > 0.0) else ""
 
     def effects(self, plan: WorkingPoint, by_range: FloatArray, by_pivot: FloatArray) -> list[Effect]:
-        # its place is known with sigma in each axis; the solver assumes that sigma for each range
-        n = len(plan.survey_sigma_m)
-        root = np.einsum("cgta,c,cd->cgtda", plan.calibration_by_place, plan.survey_sigma_m, np.eye(n))
-        return [_of_calibration(plan, by_range, root.reshape(*root.shape[:3], -1))]
+        # a solver that knows no reflection takes the sigma in each axis for one of each range by itself
+        return [Effect(np.einsum("magrt,gtx->max", by_range, plan.survey_slope), common=True)]
 
     def disturb(self, world: DrawnSites) -> None:
         world.calibration_enu_m += world.plan.survey_sigma_m[:, None] * world.normal(*world.calibration_enu_m.shape)
@@ -370,9 +367,7 @@ class ForeseenReflections:
         assert plan.calibration_stray_m is not None
         shift = plan.stray_m.copy()
         if _calibrated(plan):
-            shift[:, : plan.waves.n_tone] -= np.einsum(
-                "cgt,cgt->gt", plan.calibration_stray_m, plan.calibration_weight
-            )[:, None]
+            shift[:, : plan.waves.n_tone] -= plan.calibration_mean(plan.calibration_stray_m)[:, None]
         return [Effect(np.einsum("magrt,mgrt->ma", by_range, shift)[..., None], common=True)]
 
     def disturb(self, world: DrawnSites) -> None:

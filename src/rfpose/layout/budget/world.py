@@ -201,6 +201,7 @@ class DrawnSites:
         per_m = (2.0 * np.pi / plan.waves.wavelength_m[: plan.waves.n_tone, 0])[:, None]
         return CalibrationSight(
             place_enu_m=plan.scenario.calibration_enu_m,
+            survey_sigma_m=plan.survey_sigma_m,
             frame=draw,
             change_m=lambda shift_m, draws: average.change_rad(per_m * shift_m, draws) / per_m,
         )

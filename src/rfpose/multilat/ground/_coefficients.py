@@ -104,7 +104,7 @@ def refine(problem: GroundProblem, state: RigidFits, parameter: FloatArray) -> F
 
 
 def retry(problem: GroundProblem, start: RigidFits, state: RigidFits, parameter: FloatArray, turn: FloatArray) -> None:
-    """Solve mirrors that failed, or fit far worse than the rest, again from starts turned about."""
+    """Solve mirrors that failed, or fit far worse than they should (`_usual`), again from starts turned about."""
     ratio = state.chi2 / np.maximum(problem.dof, 1.0)
     usual = _usual(problem, state)
     rows = np.flatnonzero(has_start(start.status) & ~((state.status == 0) & (ratio <= usual)))
@@ -130,11 +130,18 @@ def information(state: RigidFits, good: BoolArray) -> FloatArray:
 
 
 def _usual(problem: GroundProblem, state: RigidFits) -> FloatArray:
-    """(mirror,) largest chi² over degrees of freedom that is not out of the ordinary."""
+    """(mirror,) largest chi² over degrees of freedom that is not out of the ordinary.
+
+    Coefficients to be found may be what is wrong, and then all mirrors fit badly: only the others tell. Known, they
+    let every mirror be judged by itself.
+    """
     dof = np.maximum(problem.dof, 1.0)
+    chance = 1.0 + 6.0 * np.sqrt(2.0 / dof)
+    if problem.n_parameter == 0:
+        return np.asarray(chance)
     solved = state.status == 0
     good = float(np.quantile((state.chi2 / dof)[solved], 0.1)) if np.any(solved) else 1.0
-    return np.asarray(np.maximum(_FAR_WORSE * good, 1.0 + 6.0 * np.sqrt(2.0 / dof)))
+    return np.asarray(np.maximum(_FAR_WORSE * good, chance))
 
 
 def _score(problem: GroundProblem, start: RigidFits, parameter: FloatArray) -> float:

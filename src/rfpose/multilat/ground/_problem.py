@@ -35,17 +35,21 @@ class CalibrationSight:
     Attributes
     ----------
     place_enu_m : (calibration receiver, xyz)
-        [m]; empty where there is no calibration.
+        Where they are surveyed [m]; empty where there is no calibration.
+    survey_sigma_m : (calibration receiver,)
+        How well, in each axis, as far as ``transmitter_sigma_m`` of what is solved does not count it [m]; None:
+        exactly. A receiver elsewhere sees another reflection, too, and all its ranges are off together.
     frame : (mirror,)
         Frame of each mirror. None: all of one.
     change_m
         How ranges change that Φ is taken off, where the ranges of each receiver are changed by ``shift_m`` (calibration
-        receiver, transmitter, tone, 1 + parameter) first: a range and its derivatives. Called with that and with frames
-        (row,), it returns (row, transmitter, tone, 1 + parameter), up to one constant a row and tone. Tones are in the
+        receiver, transmitter, tone, 1 + k) first: a range and its k derivatives. Called with that and with frames
+        (row,), it returns (row, transmitter, tone, 1 + k), up to one constant a row and tone. Tones are in the
         observations' order. Exact at any size: Φ is no linear mean of phases that differ by turns.
     """
 
     place_enu_m: FloatArray
+    survey_sigma_m: FloatArray | None = None
     frame: IntArray | None = None
     change_m: Callable[[FloatArray, IntArray], FloatArray] = plain_mean
 
@@ -58,9 +62,29 @@ class CalibrationSight:
             return sight
         return cls(place_enu_m=as_float_array("calibration_enu_m", sight, ("calibration receiver", 3)))
 
+    def by_survey(self, slope: FloatArray) -> FloatArray:
+        """Return derivatives of receivers' ranges by the three axes of every receiver that is not surveyed exactly.
+
+        Parameters
+        ----------
+        slope : (calibration receiver, transmitter, tone, xyz)
+            Of a receiver's ranges by its own place.
+
+        Returns
+        -------
+        (calibration receiver, transmitter, tone, 3 × unsure receiver)
+            In standard deviations [m].
+        """
+        sigma = np.zeros(len(slope)) if self.survey_sigma_m is None else self.survey_sigma_m
+        unsure = np.flatnonzero(sigma)
+        out = np.zeros((*slope.shape[:3], len(unsure), 3))
+        for k, c in enumerate(unsure):
+            out[c, :, :, k] = sigma[c] * slope[c]
+        return out.reshape(*slope.shape[:3], -1)
+
 
 def follow(fits: RigidFits, step: FloatArray) -> None:
-    """Let poses and clocks follow a change of the coefficients, to first order."""
+    """Let mirrors' own unknowns follow a change of the coefficients, to first order."""
     from scipy.spatial.transform import Rotation
 
     change = fits.follow @ step
@@ -70,7 +94,8 @@ def follow(fits: RigidFits, step: FloatArray) -> None:
     turn = turn * np.minimum(1.0, 0.2 / np.maximum(length, 1e-300))
     rot = Rotation.from_rotvec(np.nan_to_num(turn)).as_matrix() @ fits.rot
     fits.rot[:] = np.where(np.isfinite(fits.rot), rot, np.nan)
-    fits.clock[:] += change[:, 6:].reshape(fits.clock.shape)
+    fits.clock[:] += change[:, 6 : 6 + fits.clock[0].size].reshape(fits.clock.shape)
+    fits.survey[:] += change[:, 6 + fits.clock[0].size :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +108,7 @@ class GroundProblem:
         Coefficients given are in it; estimated ones are put in by `fit`.
     mirrors
     calibration
-        Whose reflections Φ carries.
+        Whose reflections and survey Φ carries.
     dof : (mirror,)
         Measurements and priors less a mirror's own unknowns.
     """
@@ -103,6 +128,12 @@ class GroundProblem:
     def n_parameter(self) -> int:
         """Real and imaginary parts of all estimated coefficients."""
         return 2 * int(np.sum(self.scene.column >= 0))
+
+    @property
+    def n_survey(self) -> int:
+        """Coordinates of calibration receivers that are not surveyed exactly: unknowns of each mirror."""
+        sigma = self.calibration.survey_sigma_m
+        return 0 if sigma is None or not len(self.scene.coefficient) else 3 * int(np.count_nonzero(sigma))
 
     def first_parameter(self) -> FloatArray:
         """No reflection; as Fresnel's formulas have it where they give the coefficient."""
@@ -136,18 +167,23 @@ class GroundProblem:
         place = self.calibration.place_enu_m
         if not (len(place) and len(coefficient)):
             return scene
-        n_transmitter, n_group, n_value = scene.common.shape[1:]
-        seen = np.zeros((len(place), n_transmitter, n_group, 3 + n_value))
+        n_transmitter, n_group = len(scene.transmitter), len(scene.tone_k)
+        seen = np.zeros((len(place), n_transmitter, n_group, 4 + self.n_parameter))
         shifts_at_points(len(place), scene, place, seen)
+        away = place[:, None] - scene.transmitter
+        away /= np.linalg.norm(away, axis=2, keepdims=True)
+        by_survey = self.calibration.by_survey(away[:, :, None] + seen[..., 1:4])
+        seen = np.concatenate([seen[..., :1], by_survey, seen[..., 4:]], axis=3)
         tones = np.flatnonzero(scene.tone_k)
-        common = np.zeros((len(self.frames), n_transmitter, n_group, n_value))
-        common[:, :, tones] = self.calibration.change_m(np.delete(seen, (1, 2, 3), axis=3)[:, :, tones], self.frames)
+        common = np.zeros((len(self.frames), n_transmitter, n_group, seen.shape[3]))
+        common[:, :, tones] = self.calibration.change_m(seen[:, :, tones], self.frames)
         return scene._replace(common=common)
 
     def begin(self, pivot: FloatArray, rot: FloatArray, status: IntArray) -> RigidFits:
         """Return mirrors from which to begin, with the clocks that fit them best."""
         n_cov = 6 + self.mirrors.prior.clock[0].size
-        return begin(self.mirrors, pivot, rot, status, n_cov=n_cov, n_parameter=self.n_parameter)
+        counts = {"n_cov": n_cov, "n_survey": self.n_survey, "n_parameter": self.n_parameter}
+        return begin(self.mirrors, pivot, rot, status, **counts)
 
     def fit(
         self,
@@ -164,10 +200,16 @@ class GroundProblem:
 
     def predict(self, fits: RigidFits, parameter: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
-        return predict(self.scene_at(parameter), self.mirrors, fits)
+        predicted, slope = predict(self.scene_at(parameter), self.mirrors, fits)
+        return predicted, np.delete(slope, np.arange(6, 6 + self.n_survey), axis=-1)
 
     def direct(self) -> GroundProblem:
         """Leave all reflections out."""
+        if self.n_survey:  # which count still
+            n_plane = len(self.scene.coefficient)
+            none, given = np.zeros(n_plane, np.complex128), np.full(n_plane, -1, np.int64)
+            dark = self.scene._replace(coefficient=none, column=given, common=self.scene.common[..., :1].copy())
+            return replace(self, scene=dark)
         return replace(
             self,
             calibration=CalibrationSight(place_enu_m=np.empty((0, 3))),

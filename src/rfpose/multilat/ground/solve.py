@@ -38,10 +38,10 @@ __all__ = ["GroundSolution", "joint_covariance", "solve_with_ground", "turns"]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-_TURN_RAD = 0.4
-"""How far a mirror that does not fit is turned at most to start again."""
-_N_TURN = 200
-"""Points in a cube, of which half lie in the ball."""
+_TURN_RAD, _N_TURN = 0.4, 200
+"""How far a mirror that does not fit is turned at most to start again; points in a cube, half of them in the ball."""
+_FAR_TURN_RAD, _N_FAR_TURN = 0.8, 400
+"""The same where coefficients are known: no other mirror need fit, and the direct ray's pose may be a radian off."""
 _MAX_ITERATION_DIRECT = 12
 
 
@@ -176,6 +176,8 @@ def solve_with_ground(
     state = start.copy()
     problem.fit(state, parameter)
     _coefficients.retry(problem, start, state, parameter, turn)
+    if problem.n_parameter == 0:
+        _coefficients.retry(problem, start, state, parameter, turns(_FAR_TURN_RAD, _N_FAR_TURN))
     parameter = _coefficients.refine(problem, state, parameter)
     if n_tone < len(observations):
         finest = lay_out([o.range_m for o in observations], state.pivot, state.rot)
@@ -216,14 +218,22 @@ def _behind(places: FloatArray, pivot: FloatArray, rot: FloatArray, reflectors: 
     return np.asarray(np.any(behind, axis=0)) if behind else np.zeros(len(places), np.bool_)
 
 
-def turns() -> FloatArray:
-    """Rotation vectors spread over a ball, small ones first; none at all is first of all."""
+def turns(largest_rad: float = _TURN_RAD, count: int = _N_TURN) -> FloatArray:
+    """Rotation vectors spread over a ball, small ones first; none at all is first of all.
+
+    Parameters
+    ----------
+    largest_rad
+        Radius of the ball [rad].
+    count
+        Points in a cube about it.
+    """
     from scipy.stats import qmc  # takes a second to load, and only this needs it
 
-    cube = 2.0 * qmc.Halton(3, scramble=False).random(_N_TURN) - 1.0
+    cube = 2.0 * qmc.Halton(3, scramble=False).random(count) - 1.0
     length = np.linalg.norm(cube, axis=1)
     inside = length <= 1.0
-    return np.concatenate([NO_TURN, _TURN_RAD * cube[inside][np.argsort(length[inside])]])
+    return np.concatenate([NO_TURN, largest_rad * cube[inside][np.argsort(length[inside])]])
 
 
 def _direct_probability(problem: GroundProblem, start: RigidFits) -> FloatArray:
@@ -251,8 +261,9 @@ def _coefficient_cov(problem: GroundProblem, state: RigidFits) -> FloatArray:
 
 def joint_covariance(state: RigidFits, coefficient_cov: FloatArray) -> FloatArray:
     """(mirror, unknown + parameter, unknown + parameter) of pose, clocks and coefficients."""
-    n_mirror, n_own, n_parameter = state.follow.shape
-    follow = state.follow
+    n_mirror, _, n_parameter = state.follow.shape
+    n_own = state.cov.shape[1]
+    follow = state.follow[:, :n_own]
     out = np.empty((n_mirror, n_own + n_parameter, n_own + n_parameter))
     out[:, :n_own, :n_own] = state.cov + follow @ coefficient_cov @ np.swapaxes(follow, 1, 2)
     out[:, :n_own, n_own:] = follow @ coefficient_cov

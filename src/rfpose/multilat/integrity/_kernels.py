@@ -173,7 +173,7 @@ def _judge_one(scene, mirrors, m, floor, pivot, rot, clock, data_info, data_grad
     k = n_group * n_receiver
     predicted = np.empty((1, n_receiver, n_transmitter))
     slope = np.empty((1, n_receiver, n_transmitter, 6))
-    predict(scene, scene.common[0], work_for(0), mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
+    predict(scene, scene.common[0], work_for(0), mirrors.receiver_mirror[m], pivot, rot, np.empty(0), predicted, slope)
     normal_equations(z, weight, bias_info, clock_class, predicted, slope, clock, data_info, data_gradient)
     for a in range(n):
         for b in range(a):

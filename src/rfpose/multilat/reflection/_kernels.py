@@ -31,7 +31,8 @@ class SharedGeometry(NamedTuple):
     ``image`` (plane, transmitter, 3) and ``normal`` (plane, 3); ``tone_k`` (group,) is zero for the carrier;
     ``kind`` (plane,) 0 = coefficient only, 1 = vertical, 2 = horizontal polarisation; ``permittivity`` (plane,
     transmitter); ``column`` (plane,) gives a coefficient's first parameter, −1 = known; ``common`` (frame, transmitter,
-    group, 1 + parameter) is what calibration receivers' phases carry of it, as range and its derivatives.
+    group, 1 + survey + parameter) is what calibration receivers' phases carry of it, as range and its derivatives: by
+    how far each of these receivers is from where it is surveyed, in standard deviations, and by the coefficients.
     """
 
     transmitter: Float64

@@ -41,13 +41,16 @@ class FitRule(NamedTuple):
 class RigidFits(NamedTuple):
     """Where each mirror stands, changed in place by fits; mirror is the first axis.
 
-    ``cov`` of the first unknowns (pose, then clocks) is at given coefficients; ``follow`` (mirror, unknown, parameter)
-    is how pose and clocks move with these, ``schur`` and ``rest`` the information and gradient left for them.
+    ``survey`` (mirror, 3 × calibration receiver): how far these are from where they are surveyed, in standard
+    deviations, as this mirror has it. ``cov`` of the first unknowns (pose, then clocks, then survey) is at given
+    coefficients; ``follow`` (mirror, unknown, parameter) is how the unknowns move with these, ``schur`` and ``rest``
+    the information and gradient left for them.
     """
 
     pivot: Float64
     rot: Float64
     clock: Float64
+    survey: Float64
     cov: Float64
     follow: Float64
     schur: Float64
@@ -131,15 +134,16 @@ def _direct(transmitter, receiver_mirror, pivot, rot, distance, slope):
 
 
 @kernel
-def predict(scene, common, work, receiver_mirror, pivot, rot, predicted, slope):
-    """Ranges (group, receiver, transmitter) and derivatives (…, 6 + parameter), less what the calibration carries.
+def predict(scene, common, work, receiver_mirror, pivot, rot, survey, predicted, slope):
+    """Ranges (group, receiver, transmitter) and derivatives (…, 6 + survey + parameter), less what calibration carries.
 
-    Without planes there is one group for all.
+    Without planes there is one group for all, and nothing besides the pose.
     """
     _direct(scene.transmitter, receiver_mirror, pivot, rot, predicted[0], slope[0])
     if scene.image.shape[0] == 0:
         return
-    n_parameter = slope.shape[3] - 6
+    n_survey = survey.shape[0]
+    n_parameter = slope.shape[3] - 6 - n_survey
     shift = np.zeros((predicted.shape[0], 4 + n_parameter))
     for r in range(receiver_mirror.shape[0]):
         ax, ay, az = _arm(rot, receiver_mirror[r])
@@ -154,8 +158,11 @@ def predict(scene, common, work, receiver_mirror, pivot, rot, predicted, slope):
                 slope[g, r, i, 3] = slope[0, r, i, 3] + ay * sz - az * sy
                 slope[g, r, i, 4] = slope[0, r, i, 4] + az * sx - ax * sz
                 slope[g, r, i, 5] = slope[0, r, i, 5] + ax * sy - ay * sx
-                for c in range(n_parameter):
-                    slope[g, r, i, 6 + c] = shift[g, 4 + c] - common[i, g, 1 + c]
+                for c in range(n_survey):
+                    slope[g, r, i, 6 + c] = -common[i, g, 1 + c]
+                    predicted[g, r, i] -= common[i, g, 1 + c] * survey[c]
+                for c in range(n_survey, n_survey + n_parameter):
+                    slope[g, r, i, 6 + c] = shift[g, 4 + c - n_survey] - common[i, g, 1 + c]
 
 
 @kernel
@@ -188,8 +195,8 @@ def _copy(source, target):
 
 
 @kernel
-def _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock):
-    """Pose and clocks a share of a step away from the old ones."""
+def _move(step, share, old_pivot, old_rot, old_clock, old_survey, pivot, rot, clock, survey):
+    """Pose, clocks and survey a share of a step away from the old ones."""
     n_class, n_receiver = clock.shape
     for a in range(3):
         pivot[a] = old_pivot[a] + share * step[a]
@@ -197,43 +204,58 @@ def _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock):
     for k in range(n_class):
         for r in range(n_receiver):
             clock[k, r] = old_clock[k, r] + share * step[6 + k * n_receiver + r]
+    for a in range(survey.shape[0]):
+        survey[a] = old_survey[a] + share * step[6 + clock.size + a]
 
 
 @kernel
-def _fit(scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest):
+def _pull_to_survey(survey, first, info, gradient):
+    """Add that the calibration receivers are where they were surveyed, give or take one; return that part of chi²."""
+    chi2 = 0.0
+    for a in range(survey.shape[0]):
+        info[first + a, first + a] += 1.0
+        gradient[first + a] -= survey[a]
+        chi2 += survey[a] * survey[a]
+    return chi2
+
+
+@kernel
+def _fit(scene, mirrors, m, rule, pivot, rot, clock, survey, cov, follow, schur, rest):
     """Gauss-Newton with step halving of mirror ``m`` at given coefficients; (chi², iterations, status)."""
     z, weight = mirrors.z[m], mirrors.weight[m]
     common = scene.common[mirrors.frame[m]]
     n_parameter = schur.shape[0]
-    n_own = 6 + clock.size
+    n_survey = survey.shape[0]
+    n_own = 6 + clock.size + n_survey
     n = n_own + n_parameter
     n_bent = z.shape[0] if scene.image.shape[0] > 0 else 1
     work = work_for(scene.image.shape[0])
     predicted = np.empty((n_bent, z.shape[1], z.shape[2]))
-    slope = np.empty((n_bent, z.shape[1], z.shape[2], 6 + n_parameter))
+    slope = np.empty((n_bent, z.shape[1], z.shape[2], 6 + n_survey + n_parameter))
     info = np.empty((n, n))
     lower = np.empty((n_own, n_own))
     gradient = np.empty(n)
     step = np.empty(n_own)
-    old_pivot, old_rot, old_clock = pivot.copy(), rot.copy(), clock.copy()
+    old_pivot, old_rot, old_clock, old_survey = pivot.copy(), rot.copy(), clock.copy(), survey.copy()
     chi2_before = np.inf
     share = 1.0
     chi2 = np.nan
     used = 0
     for iteration in range(rule.max_iteration):
         used = iteration + 1
-        predict(scene, common, work, mirrors.receiver_mirror[m], pivot, rot, predicted, slope)
+        predict(scene, common, work, mirrors.receiver_mirror[m], pivot, rot, survey, predicted, slope)
         chi2 = normal_equations(
             z, weight, mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock, info, gradient
         )
         add_prior(mirrors.prior, m, rot, info, 0, 6)
         chi2 += pull_to_prior(mirrors.prior, m, pivot, rot, clock, gradient)
+        chi2 += _pull_to_survey(survey, n_own - n_survey, info, gradient)
         if not math.isfinite(chi2):
             return np.inf, used, STUCK
         if chi2 > chi2_before * (1.0 + 1e-9) + 1e-6 and share > 1e-3:
             # too long a step: halve it from where it began
             share *= 0.5
-            _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
+            _move(step, share, old_pivot, old_rot, old_clock, old_survey, pivot, rot, clock, survey)
             continue
         for a in range(n_own):
             for b in range(a + 1):
@@ -252,7 +274,8 @@ def _fit(scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest):
         _copy(pivot, old_pivot)
         _copy(rot, old_rot)
         _copy(clock, old_clock)
-        _move(step, share, old_pivot, old_rot, old_clock, pivot, rot, clock)
+        _copy(survey, old_survey)
+        _move(step, share, old_pivot, old_rot, old_clock, old_survey, pivot, rot, clock, survey)
         if decrement < rule.settled and share == 1.0:
             _leave(lower, info, gradient, cov, follow, schur, rest)
             return chi2 - decrement, used, SOLVED
@@ -260,13 +283,13 @@ def _fit(scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest):
 
 
 @kernel
-def _fit_from_turns(scene, mirrors, m, rule, turn, enough, pivot, rot, clock, cov, follow, schur, rest):
+def _fit_from_turns(scene, mirrors, m, rule, turn, enough, pivot, rot, clock, survey, cov, follow, schur, rest):
     """`_fit` from the pose turned by each of ``turn`` (start, 3) until chi² is below ``enough``; else the smallest.
 
     Without any that converged: where the best of the others stopped.
     """
-    from_pivot, from_rot, from_clock = pivot.copy(), rot.copy(), clock.copy()
-    pivot_try, rot_try, clock_try = pivot.copy(), rot.copy(), clock.copy()
+    from_pivot, from_rot, from_clock, from_survey = pivot.copy(), rot.copy(), clock.copy(), survey.copy()
+    pivot_try, rot_try, clock_try, survey_try = pivot.copy(), rot.copy(), clock.copy(), survey.copy()
     cov_try, follow_try, schur_try, rest_try = cov.copy(), follow.copy(), schur.copy(), rest.copy()
     about = np.empty(3)
     best = np.inf
@@ -275,11 +298,12 @@ def _fit_from_turns(scene, mirrors, m, rule, turn, enough, pivot, rot, clock, co
     for s in range(turn.shape[0]):
         _copy(from_pivot, pivot_try)
         _copy(from_clock, clock_try)
+        _copy(from_survey, survey_try)
         for a in range(3):
             about[a] = from_rot[a, 0] * turn[s, 0] + from_rot[a, 1] * turn[s, 1] + from_rot[a, 2] * turn[s, 2]
         rotate(about, from_rot, rot_try)
         chi2, used, outcome = _fit(
-            scene, mirrors, m, rule, pivot_try, rot_try, clock_try, cov_try, follow_try, schur_try, rest_try
+            scene, mirrors, m, rule, pivot_try, rot_try, clock_try, survey_try, cov_try, follow_try, schur_try, rest_try
         )
         total += used
         if outcome == OPEN and status != SOLVED and best == np.inf:
@@ -292,6 +316,7 @@ def _fit_from_turns(scene, mirrors, m, rule, turn, enough, pivot, rot, clock, co
             _copy(pivot_try, pivot)
             _copy(rot_try, rot)
             _copy(clock_try, clock)
+            _copy(survey_try, survey)
             _copy(cov_try, cov)
             _copy(follow_try, follow)
             _copy(schur_try, schur)
@@ -307,15 +332,15 @@ def fit_many(begin, end, scene, mirrors, rule, turn, enough, to):
     for m in range(begin, end):
         if to.status[m] != SOLVED and to.status[m] != OPEN and to.status[m] != STUCK:
             continue
-        pivot, rot, clock, cov = to.pivot[m], to.rot[m], to.clock[m], to.cov[m]
+        pivot, rot, clock, survey, cov = to.pivot[m], to.rot[m], to.clock[m], to.survey[m], to.cov[m]
         follow, schur, rest = to.follow[m], to.schur[m], to.rest[m]
         if turn.shape[0] == 0:
             to.chi2[m], to.n_iteration[m], to.status[m] = _fit(
-                scene, mirrors, m, rule, pivot, rot, clock, cov, follow, schur, rest
+                scene, mirrors, m, rule, pivot, rot, clock, survey, cov, follow, schur, rest
             )
         else:
             to.chi2[m], to.n_iteration[m], to.status[m] = _fit_from_turns(
-                scene, mirrors, m, rule, turn, enough[m], pivot, rot, clock, cov, follow, schur, rest
+                scene, mirrors, m, rule, turn, enough[m], pivot, rot, clock, survey, cov, follow, schur, rest
             )
 
 
@@ -342,12 +367,12 @@ def clocks_many(begin, end, scene, mirrors, pivot, rot, clock):
 
 
 @kernel_rows
-def predict_many(begin, end, scene, mirrors, pivot, rot, predicted, slope):
+def predict_many(begin, end, scene, mirrors, pivot, rot, survey, predicted, slope):
     """`predict` for every mirror."""
     for m in range(begin, end):
         work = work_for(scene.image.shape[0])
         common = scene.common[mirrors.frame[m]]
-        predict(scene, common, work, mirrors.receiver_mirror[m], pivot[m], rot[m], predicted[m], slope[m])
+        predict(scene, common, work, mirrors.receiver_mirror[m], pivot[m], rot[m], survey[m], predicted[m], slope[m])
 
 
 @kernel_rows
@@ -367,12 +392,12 @@ def covariance_many(begin, end, scene, mirrors, floor, pivot, rot, clock, cov):
     """Covariance (unknown, unknown) of all unknowns at the given poses; rows that are not determined stay as given."""
     n_receiver, n_transmitter = mirrors.z.shape[2:]
     n = cov.shape[1]
-    work = work_for(0)
+    work, surveyed = work_for(0), np.empty(0)
     for m in range(begin, end):
         predicted = np.empty((1, n_receiver, n_transmitter))
         slope = np.empty((1, n_receiver, n_transmitter, 6))
         info, unused = np.empty((n, n)), np.empty(n)
-        predict(scene, scene.common[0], work, mirrors.receiver_mirror[m], pivot[m], rot[m], predicted, slope)
+        predict(scene, scene.common[0], work, mirrors.receiver_mirror[m], pivot[m], rot[m], surveyed, predicted, slope)
         normal_equations(
             mirrors.z[m], mirrors.weight[m], mirrors.bias_info[m], mirrors.clock_class, predicted, slope, clock[m],
             info, unused,

@@ -89,6 +89,7 @@ def begin(
     status: npt.NDArray[np.int64],
     *,
     n_cov: int,
+    n_survey: int = 0,
     n_parameter: int = 0,
 ) -> RigidFits:
     """Nothing solved yet; covariances are kept of the first ``n_cov`` unknowns."""
@@ -98,8 +99,9 @@ def begin(
         pivot=pivot.copy(),
         rot=rot.copy(),
         clock=clock.copy(),
+        survey=np.zeros((n_mirror, n_survey)),
         cov=np.full((n_mirror, n_cov, n_cov), np.nan),
-        follow=np.zeros((n_mirror, 6 + n_class * n_receiver, n_parameter)),
+        follow=np.zeros((n_mirror, 6 + n_class * n_receiver + n_survey, n_parameter)),
         schur=np.zeros((n_mirror, n_parameter, n_parameter)),
         rest=np.zeros((n_mirror, n_parameter)),
         chi2=np.full(n_mirror, np.inf),
@@ -127,11 +129,11 @@ def fit(
 
 
 def predict(scene: SharedGeometry, mirrors: MirrorArrays, fits: RigidFits) -> tuple[FloatArray, FloatArray]:
-    """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + parameter)."""
+    """Ranges (mirror, group, receiver, transmitter) and their derivatives (…, 6 + survey + parameter)."""
     n_group = mirrors.z.shape[1] if len(scene.image) else 1
     predicted = np.empty((len(mirrors.z), n_group, *mirrors.z.shape[2:]))
-    slope = np.empty((*predicted.shape, 6 + fits.schur.shape[1]))
-    _kernels.predict_many(len(predicted), scene, mirrors, fits.pivot, fits.rot, predicted, slope)
+    slope = np.empty((*predicted.shape, 6 + fits.survey.shape[1] + fits.schur.shape[1]))
+    _kernels.predict_many(len(predicted), scene, mirrors, fits.pivot, fits.rot, fits.survey, predicted, slope)
     shape = mirrors.z.shape
     return np.array(np.broadcast_to(predicted, shape)), np.array(np.broadcast_to(slope, (*shape, slope.shape[-1])))
 
