@@ -17,6 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import dask
 import distributed
 import numpy as np
 import psutil
@@ -37,6 +38,8 @@ def main() -> None:
     site = rf.load_scenario(rf.shipped_scenario("table2_100m.toml")).changed(
         radio={"frame_samples": 400_000}, simulation={"frame_count": asked.frames}
     )
+    # as those of `--workers` and scripts/cluster, workers do not look at their own stacks
+    dask.config.set({"distributed.worker.profile.enabled": False})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rec.h5"
         rf.simulate(site, seed=1).save(path)

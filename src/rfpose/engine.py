@@ -16,7 +16,7 @@ import queue
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -137,7 +137,8 @@ class Team(Protocol):
     ) -> Iterator[tuple[int, Found]]:
         """Yield (index of the item, ``function(shared, item)``) as they are done.
 
-        Elsewhere, function, items and what they share travel by pickle, and so does what is found.
+        Items that are appended meanwhile are done as well, so that what goes on from one task's result need not wait
+        for the others. Elsewhere, function, items and what they share travel by pickle, and so does what is found.
 
         Raises
         ------
@@ -259,13 +260,43 @@ class _Here:
             for i, item in enumerate(items):
                 yield i, function(shared, item)
             return
-        index = {self._pool.submit(function, shared, item): i for i, item in enumerate(items)}
+        pool, left = self._pool, dict[Any, int]()
+
+        def give(new: Sequence[Item]) -> list[Any]:
+            return [pool.submit(function, shared, item) for item in new]
+
         try:
-            for future in as_completed(index):
-                yield index[future], future.result()
+            for i, future in _in_flight(items, give, queue.SimpleQueue.get, left):
+                yield i, future.result()
         finally:
-            for future in index:
+            for future in left:
                 future.cancel()
+
+
+def _in_flight(
+    items: Sequence[Item],
+    give: Callable[[Sequence[Item]], list[Any]],
+    next_done: Callable[[queue.SimpleQueue[Any]], Any],
+    left: dict[Any, int],
+) -> Iterator[tuple[int, Any]]:
+    """Give items out, those that are appended meanwhile, too; yield (index, future) of each that is done.
+
+    ``left`` holds those that are not yet, and nothing the others: what they found may go from the worker's memory.
+    """
+    done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    n_given = 0
+    while True:
+        new = items[n_given:]
+        if new:
+            for i, future in enumerate(give(new), n_given):
+                left[future] = i
+                future.add_done_callback(done.put)
+            n_given += len(new)
+        if not left:
+            return
+        future = next_done(done)
+        yield left.pop(future), future
+        del future
 
 
 def gathered(
@@ -314,22 +345,22 @@ class _Cluster:
     def map(
         self, function: Callable[[Shared, Item], Found], items: Sequence[Item], shared: Shared
     ) -> Iterator[tuple[int, Found]]:
-        with _reaching(self._client):
-            futures = self._client.map(
-                _run, list(items), function=function, shared=shared, version=__version__, pure=False
-            )
-        index = {future.key: i for i, future in enumerate(futures)}
-        done: queue.SimpleQueue[Future[Any]] = queue.SimpleQueue()
-        for future in futures:
-            future.add_done_callback(done.put)
+        left: dict[Future[Any], int] = {}
+
+        def give(new: Sequence[Item]) -> list[Future[Any]]:
+            with _reaching(self._client):
+                given: list[Future[Any]] = self._client.map(
+                    _run, list(new), function=function, shared=shared, version=__version__, pure=False
+                )
+                return given
+
         try:
-            for _ in range(len(futures)):
-                future = self._next(done)
-                yield index[future.key], self._result(future)
+            for i, future in _in_flight(items, give, self._next, left):
+                yield i, self._result(future)
         finally:
             with ignored(), contextlib.suppress(Exception):
-                if self._client.status == "running":
-                    self._client.cancel(futures)
+                if left and self._client.status == "running":
+                    self._client.cancel(list(left))
 
     def _next(self, done: queue.SimpleQueue[Future[Any]]) -> Future[Any]:
         """Return the next that is done, while there is anybody to do it."""
@@ -417,7 +448,9 @@ def _local_cluster(n_worker: int) -> Iterator[Any]:
 
     threads = max(1, n_core() // n_worker)
     environment = dict(dask.config.get("distributed.nanny.pre-spawn-environ")) | {"NUMBA_NUM_THREADS": threads}
-    with dask.config.set({"distributed.nanny.pre-spawn-environ": environment}):
+    # a look at its own stack each 10 ms costs a worker 2 % of a core, and nobody sees what it finds
+    quiet = {"distributed.worker.profile.enabled": False}
+    with dask.config.set({"distributed.nanny.pre-spawn-environ": environment} | quiet):
         # encrypted, since whoever may speak to a scheduler may run any code, and others may be on this machine
         cluster = LocalCluster(
             n_workers=n_worker,

@@ -21,8 +21,10 @@ from rfpose import engine
 from rfpose.engine import Engine, team_here, team_of
 from rfpose.errors import ClusterError, InvalidInputError, RecordingError, install_remedy
 from rfpose.pipeline import measure
+from rfpose.pipeline.formats.journal import Journal
 from rfpose.pipeline.process import process
 from rfpose.pipeline.simulate import simulate
+from rfpose.recording import frame_starts
 from rfpose.scenario import load_scenario
 
 distributed = pytest.importorskip("distributed", reason="needs the extra `distributed`")
@@ -70,7 +72,7 @@ def cluster() -> Iterator[distributed.LocalCluster]:
 
 @pytest.fixture
 def small_entries(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measure, "JOURNAL_SAMPLES", 6 * 8000)
+    monkeypatch.setattr(measure, "JOURNAL_SAMPLES", 3 * 8000)
 
 
 def _done(by: Engine, job: Callable[[], Any]) -> Any:
@@ -212,6 +214,66 @@ def test_results_are_told_by_their_item(cluster: distributed.LocalCluster) -> No
     for used, team_for in ((Engine(), team_of), (by, team_of), (by, team_here)):
         with used.used(), team_for() as team:
             assert dict(team.map(divmod, [2, 3, 5], 7)) == {0: (3, 1), 1: (2, 1), 2: (1, 2)}
+
+
+def test_items_that_are_appended_meanwhile_are_done_and_what_was_found_leaves_workers(
+    cluster: distributed.LocalCluster,
+) -> None:
+    by = Engine(scheduler=cluster.scheduler_address)
+    for used, team_for in ((Engine(), team_of), (by, team_of), (by, team_here)):
+        items, found = [3, 40], {}
+        with used.used(), team_for() as team:
+            for i, (_, rest) in team.map(divmod, items, 1000):
+                found[items[i]] = rest
+                if items[i] < 9:
+                    items.append(items[i] + 1)
+                if len(found) == 8 and team_for is team_of and used is by:
+                    assert _soon(lambda: _n_held(cluster) <= 1)
+        assert found == {item: 1000 % item for item in (40, *range(3, 10))}
+
+
+def _n_held(cluster: distributed.LocalCluster) -> int:
+    """Return how many results workers hold."""
+    with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
+        return len(client.who_has())
+
+
+def _soon(holds: Callable[[], bool]) -> bool:
+    """Tell whether something holds, or soon does."""
+    for _ in range(50):
+        if holds():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def test_entries_keep_the_clocks_of_their_ends(
+    recording: Path, cluster: distributed.LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some receivers are measured an entry ahead of others."""
+    monkeypatch.setattr(measure, "JOURNAL_SAMPLES", 8000)
+    opened = measure.open_recording(recording)
+    site = opened.scenario
+    assert site is not None
+    starts = frame_starts(opened, site.radio.frame_samples)
+    journal = Journal(tmp_path / "kept", {}, restart=False)
+    with Engine(scheduler=cluster.scheduler_address).used():
+        tones = measure.measure_tones(
+            opened,
+            site,
+            starts,
+            estimator="hilbert",
+            journal=journal,
+            elsewhere=measure.OtherProcesses(paths=(recording,)),
+        )
+    opened.close()
+    entries = journal.read()
+    assert [(first, end) for first, end, _ in entries] == [(row, min(row + 8, 42)) for row in range(0, 42, 8)]
+    n, clocks = len(site.receiver_ids), tones.clock_ppm.ravel()
+    for _, end, entry in entries:
+        last = [max((row for row in range(i, end, n)), default=None) for i in range(n)]
+        wanted = [np.nan if row is None else clocks[row] for row in last]
+        np.testing.assert_array_equal(entry["clock_state_ppm"], wanted)
 
 
 def test_nobody_there_is_told_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

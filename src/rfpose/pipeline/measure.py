@@ -29,11 +29,11 @@ __all__ = ["JOURNAL_SAMPLES", "FrameByFrame", "OtherProcesses", "extractors", "j
 JOURNAL_SAMPLES = 40_000_000
 """Samples measured here between two entries of the journal: a small part of a second's work for each core."""
 _LONGER_ELSEWHERE = 4
-"""So many times as long are entries for each thread elsewhere, which has nothing to do from one to the next."""
+"""So many times as long are entries for each thread elsewhere, for tasks that are worth giving out."""
 
-_PER_THREAD = 4
-"""Tasks of an entry for each thread elsewhere: enough that none waits long for the last one of another, and so few that
-giving them out costs little."""
+_PER_THREAD = 2
+"""Tasks of an entry for each thread elsewhere: one to do and one that lies there when it is done. Giving one out takes
+4 ms of the processors, whatever it holds."""
 
 _PER_THREAD_HERE = 16
 """The same for each thread here, to which they go in no time."""
@@ -137,21 +137,11 @@ def measure_tones(
     stages = Stopwatch() if stages is None else stages
     n_receiver = len(scenario.receiver_ids)
     n_row = len(frame_start_index) * n_receiver
-    tones = TonePhases.empty(
-        receiver_ids=scenario.receiver_ids,
-        transmitter_ids=scenario.transmitter_ids,
-        tone_hz=scenario.tone_hz,
-        frame_start_index=frame_start_index,
-    )
+    tones = _empty(scenario, scenario.receiver_ids, frame_start_index)
     rows = _rows(tones)
     # where each receiver's clock was last seen; it is searched anew after a frame in which nothing was found
     clock_ppm = np.full(n_receiver, np.nan)
-    done = 0
-    for first, end, entry in journal.read() if journal is not None else ():
-        for name, values in rows.items():
-            values[first:end] = entry[name]
-        clock_ppm[:] = entry[_CLOCK_STATE]
-        done = end
+    done = 0 if journal is None else _resume(journal, rows, clock_ppm)
     if done == n_row:
         return tones
     recipe = _Recipe(scenario=scenario, frame_start_index=frame_start_index, estimator=estimator)
@@ -159,19 +149,27 @@ def measure_tones(
     with _team_here(scenario) if elsewhere is None else team_of() as team:
         share = _share_here(bench, n_receiver, team) if elsewhere is None else _share_elsewhere(bench, elsewhere, team)
         stages.cores = team.n_at_once
-        while done < n_row:
-            first, end = done, min(done + share.rows, n_row)
-            wanted = [_Wanted(first, end, group, clock_ppm[group]) for group in share.groups]
-            for i, measured in team.map(share.measure, wanted, share.shared):
-                clock_ppm[wanted[i].i_receiver] = measured.clock_ppm
-                for row, found in measured.rows:
-                    _put(rows, row, found)
-                for name, seconds in measured.seconds.items():
-                    stages.seconds[name] += seconds
-                stages.samples += measured.samples
-                done += len(measured.rows)
-                if on_progress is not None and measured.rows:
-                    on_progress(done, n_row)
+        end = min(done + share.rows, n_row)
+        wanted = [_Wanted(done, end, group, clock_ppm[group]) for group in share.groups]
+        # some receivers are an entry ahead of others: nobody waits for the last of an entry
+        under_way: dict[int, list[tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]]] = {}
+        for i, measured in team.map(share.measure, wanted, share.shared):
+            first, end, group = wanted[i].first, wanted[i].end, wanted[i].i_receiver
+            if end < n_row:
+                wanted.append(_Wanted(end, min(end + share.rows, n_row), group, measured.clock_ppm))
+            _put(rows, measured)
+            for name, seconds in measured.seconds.items():
+                stages.seconds[name] += seconds
+            stages.samples += measured.samples
+            done += len(measured.row)
+            if on_progress is not None and len(measured.row):
+                on_progress(done, n_row)
+            parts = under_way.setdefault(first, [])
+            parts.append((group, measured.clock_ppm))
+            if len(parts) < len(share.groups):
+                continue
+            for group, clocks in under_way.pop(first):
+                clock_ppm[group] = clocks
             if journal is not None:
                 entry = {name: values[first:end] for name, values in rows.items()}
                 journal.append(first, end, {**entry, _CLOCK_STATE: clock_ppm})
@@ -236,20 +234,23 @@ class FrameByFrame:
         scenario, n_receiver = self._recipe.scenario, self._bench.n_receiver
         starts = np.array([start_index], np.int64)
         self._bench.recipe = replace(self._recipe, frame_start_index=starts)
-        tones = TonePhases.empty(
-            receiver_ids=scenario.receiver_ids,
-            transmitter_ids=scenario.transmitter_ids,
-            tone_hz=scenario.tone_hz,
-            frame_start_index=starts,
-        )
+        tones = _empty(scenario, scenario.receiver_ids, starts)
         arrays = _rows(tones)
         groups = _groups(n_receiver, _PER_THREAD_HERE * self._team.n_at_once)
         wanted = [_Wanted(0, n_receiver, group, self._clock_ppm[group]) for group in groups]
         for i, measured in self._team.map(_measure_here, wanted, self._bench):
             self._clock_ppm[groups[i]] = measured.clock_ppm
-            for row, found in measured.rows:
-                _put(arrays, row, found)
+            _put(arrays, measured)
         return tones
+
+
+def _empty(scenario: Scenario, receiver_ids: tuple[str, ...], starts: npt.NDArray[np.int64]) -> TonePhases:
+    return TonePhases.empty(
+        receiver_ids=receiver_ids,
+        transmitter_ids=scenario.transmitter_ids,
+        tone_hz=scenario.tone_hz,
+        frame_start_index=starts,
+    )
 
 
 def _rows(tones: TonePhases) -> Entry:
@@ -258,10 +259,21 @@ def _rows(tones: TonePhases) -> Entry:
     return {name: array.reshape(-1, *array.shape[2:], copy=False) for name, array in arrays.items()}
 
 
-def _put(rows: Entry, row: int, found: FrameTones) -> None:
-    """Store one frame of one receiver."""
+def _resume(journal: Journal, rows: Entry, clock_ppm: npt.NDArray[np.float64]) -> int:
+    """Take over what a journal has, and clocks (receiver,) at its end; return how many rows there are."""
+    done = 0
+    for first, end, entry in journal.read():
+        for name, values in rows.items():
+            values[first:end] = entry[name]
+        clock_ppm[:] = entry[_CLOCK_STATE]
+        done = end
+    return done
+
+
+def _put(rows: Entry, measured: _Measured) -> None:
+    """Store what was measured."""
     for name, values in rows.items():
-        values[row] = getattr(found, name)
+        values[measured.row] = measured.found[name]
 
 
 # -- how the work is shared ----------------------------------------------------------------------------------
@@ -282,7 +294,9 @@ class _Wanted:
 class _Measured:
     """What came of it; stages as in `Stopwatch`."""
 
-    rows: list[tuple[int, FrameTones]]
+    row: npt.NDArray[np.int64]
+    found: Entry
+    """Columns of these rows."""
     clock_ppm: npt.NDArray[np.float64]
     seconds: Mapping[str, float]
     samples: int
@@ -361,17 +375,23 @@ class _Bench:
 
     def measure(self, wanted: _Wanted) -> _Measured:
         """Measure rows, each receiver's in order, since its clock is followed."""
-        stages, clock_ppm, rows = Stopwatch(), wanted.clock_ppm.copy(), []
+        stages, clock_ppm, n = Stopwatch(), wanted.clock_ppm.copy(), self.n_receiver
+        firsts = (wanted.first + (int(i_receiver) - wanted.first) % n for i_receiver in wanted.i_receiver)
+        rows_of = [np.arange(first, wanted.end, n) for first in firsts]
+        row = np.concatenate(rows_of)
+        found = _rows(_empty(self.recipe.scenario, ("any",), row))
+        at = 0
         for k, i_receiver in enumerate(wanted.i_receiver):
-            begin = wanted.first + (int(i_receiver) - wanted.first) % self.n_receiver
-            for row in range(begin, wanted.end, self.n_receiver):
+            for each in rows_of[k]:
                 with stages.during("read"):
-                    samples = self._read(row)
+                    samples = self._read(int(each))
                 with stages.during("tones", 0 if isinstance(samples, LineStatus) else len(samples)):
-                    found = self._found(int(i_receiver), samples, float(clock_ppm[k]))
-                rows.append((row, found))
-                clock_ppm[k] = found.clock_ppm if np.any(found.status == LineStatus.OK) else np.nan
-        return _Measured(rows, clock_ppm, stages.seconds, stages.samples)
+                    frame = self._found(int(i_receiver), samples, float(clock_ppm[k]))
+                for name, values in found.items():
+                    values[at] = getattr(frame, name)
+                clock_ppm[k] = frame.clock_ppm if np.any(frame.status == LineStatus.OK) else np.nan
+                at += 1
+        return _Measured(row, found, clock_ppm, stages.seconds, stages.samples)
 
     def _found(self, i_receiver: int, samples: Samples | LineStatus, clock_ppm: float) -> FrameTones:
         extractor = self._extractor_of(self._receiver_ids[i_receiver])
