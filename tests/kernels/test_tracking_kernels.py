@@ -9,7 +9,7 @@ import numpy as np
 
 from rfpose.feedback.columns import PARAMETERS, constant
 from rfpose.feedback.mount import Actuator, Mount, posture
-from rfpose.feedback.tracking import TrackingSimulation
+from rfpose.feedback.tracking import TrackingSimulation, _kernels
 from rfpose.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COURSES = """
 import sys
 import numpy as np
-from rfpose.feedback.tracking import TrackingSimulation
+from rfpose.feedback.tracking import TrackingSimulation, _kernels
 from rfpose.scenario import load_scenario
 base = load_scenario(sys.argv[1])
 found = {}
@@ -107,3 +107,12 @@ def test_mirrors_stand_as_their_mounts_say_by_the_names_of_parameters():
             }
             wanted = posture(mount.replace(**tilts), curves.motor_count[t, row]).normal_enu
             np.testing.assert_allclose(curves.normal_enu[t, row], wanted, atol=1e-12)
+
+
+def test_an_error_falls_into_the_bin_of_its_logarithm():
+    rng = np.random.default_rng(0)
+    angle = np.concatenate([10.0 ** rng.uniform(-8.0, 1.0, 100_000), [0.0, 1e-6, np.inf, np.nan]])
+    bins = np.array([_kernels.bin_of.py_func(each) for each in angle])
+    by_logarithm = np.floor(_kernels.BINS_PER_DECADE * np.log10(np.maximum(angle[:-1], 1e-6) / _kernels.LOWEST_RAD))
+    np.testing.assert_array_equal(bins[:-1], np.minimum(by_logarithm, _kernels.N_BIN - 1))
+    assert bins[-1] == _kernels.N_BIN - 1

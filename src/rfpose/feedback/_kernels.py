@@ -25,6 +25,8 @@ N_PREPARED = 22
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
 _STEEP = 1.2  # an elevation that is safely on this side of the zenith [rad]
+_LAST = 1e-9  # so far off [rad], a step of Newton's method with slopes from nearby is the last: it leaves some 1e-13
+_LITTLE = 1e-3  # an angle whose series ends beneath rounding after the terms taken [rad]
 
 
 @kernel_lean
@@ -297,46 +299,69 @@ def command_one(p, k, prepared, m, near, out, state, wanted):
 
 
 @kernel_lean
+def _turned(s, c, angle, by):
+    """Sine and cosine of an angle from those before it turned by a little."""
+    if abs(by) > _LITTLE:
+        return math.sin(angle), math.cos(angle)
+    square = by * by
+    sine, less = by * (1.0 - square / 6.0 * (1.0 - square / 20.0)), square / 2.0 * (1.0 - square / 12.0)
+    return s + (c * sine - s * less), c - (s * sine + c * less)
+
+
+@kernel_lean
 def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, wanted):
     """Newton's method from axis angles; those that it ends with go to ``found``, NaN if it does not."""
     found[0] = found[1] = np.nan
-    done = False
+    done = first = True
+    # light from and to far away wants the same normal wherever the mirror's centre is
+    moves = m[M.source_is_point] != 0.0 or m[M.target_is_point] != 0.0
+    sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
+    a0 = a1 = a2 = b0 = b1 = b2 = 0.0
     for _ in range(30):
-        sa, ca = math.sin(azimuth), math.cos(azimuth)
-        _pose(sa, ca, math.sin(elevation), math.cos(elevation), p, prepared, 0.0, state)
-        bisector(m, state[3:], wanted)
+        _pose(sa, ca, se, ce, p, prepared, 0.0, state)
+        if moves or first:
+            bisector(m, state[3:], wanted)
         n0, n1, n2 = state[0], state[1], state[2]
         e0, e1, e2 = wanted[0] - n0, wanted[1] - n1, wanted[2] - n2
-        if not (e0 * e0 + e1 * e1 + e2 * e2 < 10.0):
+        square = e0 * e0 + e1 * e1 + e2 * e2
+        if not (square < 10.0):
             return 1
-        if e0 * e0 + e1 * e1 + e2 * e2 < 1e-26:
-            done = True
+        done = square < _LAST * _LAST
+        if square < 1e-26:
             break
-        # what the normal moves by when axis 1 turns, and axis 2: n × axis; sag changes that little
-        z0, z1, z2 = prepared[2], prepared[5], prepared[8]
-        x, y, u = -ca * prepared[OBLIQUE + 1], sa * prepared[OBLIQUE + 1], -prepared[OBLIQUE]
-        r0 = prepared[0] * x + prepared[1] * y + prepared[2] * u
-        r1 = prepared[3] * x + prepared[4] * y + prepared[5] * u
-        r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
-        a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
-        b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
-        # the centre goes with it, and with the centre the normal that is wanted
-        c0, c1, c2 = state[3] - prepared[PIVOT], state[4] - prepared[PIVOT + 1], state[5] - prepared[PIVOT + 2]
-        d0, d1, d2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
-        a0, a1, a2 = a0 - d0, a1 - d1, a2 - d2
-        x, y = sa * p[P.axis_offset_m], ca * p[P.axis_offset_m]
-        c0 -= prepared[0] * x + prepared[1] * y
-        c1 -= prepared[3] * x + prepared[4] * y
-        c2 -= prepared[6] * x + prepared[7] * y
-        d0, d1, d2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
-        b0, b1, b2 = b0 - d0, b1 - d1, b2 - d2
+        if first or not done:
+            # what the normal moves by when axis 1 turns, and axis 2: n × axis; sag changes that little
+            z0, z1, z2 = prepared[2], prepared[5], prepared[8]
+            x, y, u = -ca * prepared[OBLIQUE + 1], sa * prepared[OBLIQUE + 1], -prepared[OBLIQUE]
+            r0 = prepared[0] * x + prepared[1] * y + prepared[2] * u
+            r1 = prepared[3] * x + prepared[4] * y + prepared[5] * u
+            r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
+            a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
+            b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
+            if moves:
+                # the centre goes with it, and with the centre the normal that is wanted
+                c0, c1, c2 = state[3] - prepared[PIVOT], state[4] - prepared[PIVOT + 1], state[5] - prepared[PIVOT + 2]
+                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
+                a0, a1, a2 = a0 - d0, a1 - d1, a2 - d2
+                x, y = sa * p[P.axis_offset_m], ca * p[P.axis_offset_m]
+                c0 -= prepared[0] * x + prepared[1] * y
+                c1 -= prepared[3] * x + prepared[4] * y
+                c2 -= prepared[6] * x + prepared[7] * y
+                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
+                b0, b1, b2 = b0 - d0, b1 - d1, b2 - d2
         aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
         ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
         determinant = aa * bb - ab * ab
         if determinant < 1e-14:
             return 1
-        azimuth += (bb * ae - ab * be) / determinant
-        elevation += (aa * be - ab * ae) / determinant
+        by_azimuth, by_elevation = (bb * ae - ab * be) / determinant, (aa * be - ab * ae) / determinant
+        azimuth += by_azimuth
+        elevation += by_elevation
+        if done:
+            break
+        sa, ca = _turned(sa, ca, azimuth, by_azimuth)
+        se, ce = _turned(se, ce, elevation, by_elevation)
+        first = False
     if not done:
         return 1
     if abs(azimuth) > math.pi:  # where a guess was a turn away

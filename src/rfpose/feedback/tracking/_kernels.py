@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.checks import FloatArray
-from rfpose.feedback._kernels import N_PREPARED, N_ROW, axis_angle, bisector, command_one, posture, prepare, stand
+from rfpose.feedback._kernels import N_PREPARED, N_ROW, axis_angle, command_one, posture, prepare, stand
 from rfpose.feedback.columns import K, M, P
 from rfpose.feedback.servo._kernels import DriveNumbers, LawNumbers, law_step, stepper_step
 from rfpose.jit import kernel, kernel_lean
@@ -55,6 +55,17 @@ RESPONSE_S = 30.0
 
 BINS_PER_DECADE, N_BIN = 32, 160
 LOWEST_RAD = 1e-6
+_EDGES = LOWEST_RAD * 10.0 ** (np.arange(N_BIN + 1) / BINS_PER_DECADE)
+# an octave in so many equal parts, none of which holds two edges; the bin in which each part begins, and one beyond
+_PARTS = 32
+_OCTAVES = math.ceil(math.log2(_EDGES[-1] / LOWEST_RAD))
+_BEGINS = np.array(
+    [
+        np.searchsorted(_EDGES, LOWEST_RAD * 2.0**octave * (1.0 + part / _PARTS), side="right") - 1
+        for octave in range(_OCTAVES)
+        for part in range(_PARTS)
+    ]
+)
 
 _NEAR_ZENITH = 0.05
 _LIMIT_RAD = 0.1
@@ -274,9 +285,11 @@ class Workspace(NamedTuple):
     across: FloatArray
     counts: FloatArray
     row: FloatArray
-    receiver: FloatArray
     aside: FloatArray
     work: FloatArray
+    to_aim: FloatArray
+    to_receiver: FloatArray
+    believed: FloatArray
     jacobian: FloatArray
     gain: FloatArray
 
@@ -287,7 +300,8 @@ def _workspace():
     return Workspace(
         np.empty(len(P)), np.empty(N_PREPARED), np.empty(N_PREPARED), np.empty(6), np.empty(6), np.empty(6),
         np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(2), np.empty(2), np.empty(N_ROW),
-        np.empty(N_ROW), np.empty(N_ROW), np.empty(6), np.empty((2, len(P))), np.empty((len(P), 2)),
+        np.empty(N_ROW), np.empty(6), np.empty(3), np.empty(3), np.empty(2), np.empty((2, len(P))),
+        np.empty((len(P), 2)),
     )  # fmt: skip
 
 
@@ -306,6 +320,18 @@ def _caught(error, table, per_rad):
         return 0.0
     i = int(place)
     return table[i] + (place - i) * (table[i + 1] - table[i])
+
+
+@kernel_lean
+def bin_of(angle):
+    """Bin of an error: the logarithm's, without the time that a logarithm takes."""
+    if not angle < _EDGES[N_BIN - 1]:
+        return N_BIN - 1
+    if angle < _EDGES[1]:
+        return 0
+    fraction, octave = math.frexp(angle / LOWEST_RAD)
+    found = _BEGINS[(octave - 1) * _PARTS + int(_PARTS * (2.0 * fraction - 1.0))]
+    return found + 1 if angle >= _EDGES[found + 1] else found
 
 
 @kernel_lean
@@ -328,13 +354,28 @@ def _flatten(n, v):
 
 
 @kernel_lean
-def _off(row, posture, wanted):
-    """Angle between a normal and the one that the row wants from this mirror centre."""
-    bisector(row, posture[3:], wanted)
-    total = 0.0
-    for i in range(3):
-        total += (wanted[i] - posture[i]) ** 2
-    return math.sqrt(total)
+def _towards(point, centre, out):
+    """Write the direction from a mirror's centre to a point."""
+    x, y, z = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
+    length = math.sqrt(x * x + y * y + z * z)
+    out[0], out[1], out[2] = x / length, y / length, z / length
+
+
+@kernel_lean
+def _off(n, sun, towards, wanted):
+    """Angle between a normal and the one, written, that sends the sun's light towards a direction."""
+    x, y, z = sun[0] + towards[0], sun[1] + towards[1], sun[2] + towards[2]
+    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+    wanted[0], wanted[1], wanted[2] = x * inverse, y * inverse, z * inverse
+    return math.sqrt((wanted[0] - n[0]) ** 2 + (wanted[1] - n[1]) ** 2 + (wanted[2] - n[2]) ** 2)
+
+
+@kernel_lean
+def _believe(motor, p, k, prepared, last, out):
+    """Write normal and centre by the model at motor positions, unless they are the ``last``, for which it has them."""
+    if motor[0] != last[0] or motor[1] != last[1]:
+        stand(motor[0], motor[1], p, k, prepared, 0.0, out)
+        last[0], last[1] = motor[0], motor[1]
 
 
 @kernel_lean
@@ -451,12 +492,13 @@ def _swing(loop, noise, rate_right, rate_up, state):
 
 
 @kernel_lean
-def _bend(n, right, up):
-    """Turn a normal by small angles."""
-    h = max(math.sqrt(n[0] * n[0] + n[1] * n[1]), 1e-9)
+def _bend(n, level, right, up):
+    """Turn a normal, whose level part is so long, by small angles."""
+    h = max(level, 1e-9)
     x, y, z = n[0], n[1], n[2]
-    n[0] = x - right * y / h - up * x * z / h
-    n[1] = y + right * x / h - up * y * z / h
+    turn, lift = right / h, up * z / h
+    n[0] = x - turn * y - lift * x
+    n[1] = y + turn * x - lift * y
     n[2] = z + up * h
     inverse = 1.0 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
     for i in range(3):
@@ -468,7 +510,7 @@ def _track(h, first, end, tasks, stretch, room):
     """One mirror through steps ``first`` to before ``end`` of a stretch."""
     loop, law, drive_1, drive_2, table = stretch.steering
     duty, renew, scored, mode = tasks.duty[h], tasks.renew[h] > 0, tasks.scored[h] > 0, tasks.mode[h]
-    goal, heard, age = tasks.goal[h], tasks.heard[h], tasks.age[h]
+    aim, goal, heard, age = tasks.aim[h], tasks.goal[h], tasks.heard[h], tasks.age[h]
     built, k, lean, target = (
         stretch.mounts.true[h], stretch.mounts.constant[h], stretch.mounts.lean[h], stretch.mounts.target[h]
     )  # fmt: skip
@@ -490,21 +532,21 @@ def _track(h, first, end, tasks, stretch, room):
     trace = stretch.courses.trace[max(stretch.courses.stored[h], 0)]
     step0 = stretch.step0
     p, prepared, known, guess, true, still = room[:6]
-    wanted, hoped, error, change, seen, across, counts, row, receiver, aside, work = room[6:17]
+    wanted, hoped, error, change, seen, across, counts, row, aside, work, to_aim, to_receiver, believed = room[6:19]
     is_dish = target[3] > 0.5
     _copy(built, p)
     row[:] = 0.0
-    _copy(tasks.aim[h], row[M.target_enu : M.target_enu + 3])
+    _copy(aim, row[M.target_enu : M.target_enu + 3])
     row[M.target_is_point] = 0.0 if is_dish else 1.0
     row[M.sigma_rad] = 1.0
-    _copy(row, receiver)
-    _copy(target, receiver[M.target_enu : M.target_enu + 3])
     aside[:] = 0.0
     aside[M.sigma_rad] = 1.0  # a row whose light comes from and goes to one direction
     plate_up, plate_right = p[P.receiver_plane_up_rad], p[P.receiver_plane_right_rad]
     prepare(model, k, known)
     near, aimed, turned_by = state[EXPECTED:AIMED], state[AIMED:TURNED], state[TURNED:N_STATE]
-    shift = state[SHIFT:RAMP]
+    shift, motor = state[SHIFT:RAMP], state[MOTOR:AXIS]
+    believed[:] = np.nan
+    level = 0.0
     stood_1 = stood_2 = np.nan
     axis_1 = axis_2 = 0.0
     turned = True
@@ -588,7 +630,7 @@ def _track(h, first, end, tasks, stretch, room):
                     for a in range(2 if not busy else 0):
                         state[SLIP + a] += seconds * law.gain * entry[1 + a]
                 elif not busy:  # out of reach, or with a motor flat out on its way: nothing winds up meanwhile
-                    stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
+                    _believe(motor, model, k, known, believed, guess)
                     for i in range(3):
                         speed, state[RAMP + i] = law_step(entry[1 + i], state[RAMP + i], law, seconds)
                         change[i] = state[SHIFT + i]
@@ -619,15 +661,15 @@ def _track(h, first, end, tasks, stretch, room):
                 m = state[LEARNED]
                 across[0], across[1] = state[INNOVATION] / m, state[INNOVATION + 1] / m
                 own = 0.5 * (spread[0] * spread[0] + spread[1] * spread[1] + spread[2] * spread[2])
-                stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
+                _believe(motor, model, k, known, believed, guess)
                 for i in range(3):
                     state[SHIFT + i] -= guess[i]
                 _learn(
-                    model, k, state[MOTOR : MOTOR + 2], free, scale, own / m + loop.wind_variance, across, cov, walk,
-                    known, guess, room,
-                )  # fmt: skip
+                    model, k, motor, free, scale, own / m + loop.wind_variance, across, cov, walk, known, guess, room
+                )
                 # what the model has learned comes off the shift, so that the mirror does not jump
-                stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
+                believed[:] = np.nan
+                _believe(motor, model, k, known, believed, guess)
                 for i in range(3):
                     state[SHIFT + i] += guess[i]
                 state[LEARNED] = state[INNOVATION] = state[INNOVATION + 1] = 0.0
@@ -660,24 +702,27 @@ def _track(h, first, end, tasks, stretch, room):
             turned = True
         if turned:  # in most seconds no motor takes a step
             posture(axis_1, axis_2, p, prepared, 0.0, still)
+            level = math.sqrt(still[0] * still[0] + still[1] * still[1])
+            if not is_dish:
+                _towards(aim, still[3:], to_aim)
+                _towards(target, still[3:], to_receiver)
             turned = False
         _copy(still, true)
         push = mean_speed * mean_speed + 2.0 * mean_speed * gust[s]
         right, up = bend[0] * push, bend[1] * push
         if loop.swings:
-            _swing(loop, swing[s], -math.sqrt(true[0] * true[0] + true[1] * true[1]) * change[0], change[1], state)
+            _swing(loop, swing[s], -level * change[0], change[1], state)
             right += state[SWING]
             up += state[SWING + 2]
-        _bend(true, right, up)
-        for i in range(3):
-            row[M.source_enu + i] = receiver[M.source_enu + i] = sun[s, i]
-            if is_dish:
-                row[M.target_enu + i] = receiver[M.target_enu + i] = sun[s, i]
-        angle = _off(row, true, wanted)
+        _bend(true, level, right, up)
+        if is_dish:
+            _copy(sun[s], to_aim)
+            _copy(sun[s], to_receiver)
+        angle = _off(true, sun[s], to_aim, wanted)
         facing = max(true[0] * sun[s, 0] + true[1] * sun[s, 1] + true[2] * sun[s, 2], 0.0)
         if tick or s % stride == 0 or s == end - 1:
             # what the receiver gets, whatever the mirror is told to aim at
-            off = angle if scored else _off(receiver, true, hoped)
+            off = angle if scored else _off(true, sun[s], to_receiver, hoped)
             offered = facing
             if not scored:
                 offered = max(hoped[0] * sun[s, 0] + hoped[1] * sun[s, 1] + hoped[2] * sun[s, 2], 0.0)
@@ -705,13 +750,8 @@ def _track(h, first, end, tasks, stretch, room):
                 beam = angle
                 if not is_dish:
                     beam = 0.0
-                    length = 0.0
                     for i in range(3):
-                        work[i] = target[i] - true[3 + i]
-                        length += work[i] ** 2
-                    length = math.sqrt(length)
-                    for i in range(3):
-                        beam += (2.0 * facing * true[i] - sun[s, i] - work[i] / length) ** 2
+                        beam += (2.0 * facing * true[i] - sun[s, i] - to_receiver[i]) ** 2
                     beam = math.sqrt(beam)
                 total[STEPS] += 1.0
                 total[SQUARE] += angle * angle
@@ -720,8 +760,7 @@ def _track(h, first, end, tasks, stretch, room):
                 total[BEAM_WORST] = max(total[BEAM_WORST], beam)
                 hours[hour_of[s], 0] += 1.0
                 hours[hour_of[s], 1] += angle * angle
-                slot = int(BINS_PER_DECADE * math.log10(max(angle, LOWEST_RAD) / LOWEST_RAD))
-                histogram[min(slot, N_BIN - 1)] += 1
+                histogram[bin_of(angle)] += 1
                 if power[s] > 0.0:
                     total[SUNSHINE] += loop.servo_s
                 if emerged:
@@ -758,7 +797,7 @@ def _track(h, first, end, tasks, stretch, room):
         # flat out a mirror is somewhere on its way: that is nothing to steer by or to learn from
         slewing = abs(state[MOVED]) >= 0.999 * drive_1.speed or abs(state[MOVED + 1]) >= 0.999 * drive_2.speed
         entry[0] = HEARD if duty == GO or slewing else USED
-        stand(state[MOTOR], state[MOTOR + 1], model, k, known, 0.0, guess)
+        _believe(motor, model, k, known, believed, guess)
         if loop.feedback == RADIO:
             if settled:
                 total[FRAMES] += 1.0
@@ -788,7 +827,11 @@ def _track(h, first, end, tasks, stretch, room):
             _across(true, error, across)
             entry[4] = across[0] + right
             entry[5] = across[1] + up
-            bisector(row, guess[3:], hoped)
+            if not is_dish:
+                _towards(aim, guess[3:], seen)
+                _off(guess, sun[s], seen, hoped)
+            else:
+                _copy(sun[s], hoped)
             for i in range(3):
                 error[i] = hoped[i] - true[i]
             _across(true, error, across)
