@@ -194,3 +194,25 @@ def test_options_are_refused_by_their_own_names(files, arguments, code, message)
     found, _, error = run("layout", command, files["scenario"], *options)
     assert found == code, error
     assert message in error
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--format raw --sample-type ci16_le", "`--rate` must be given for raw samples"),
+        ("--format raw --rate 1000", "`--sample-type` must be given for raw samples"),
+        ("--format raw --sample-type ci16_le --rate -3", "`--rate` must be a rate from"),
+        ("--format raw --sample-type ci16_le --rate 1e3 --centre x", "`--centre` must be a number"),
+        ("--format raw --sample-type ci16_le --rate 1e3 --start tomorrow", "`--start` must be a time such as"),
+        ("--format raw --sample-type ci16_le --rate 1e3 --start 2026-06-21", "`--start` must be a time such as"),
+        ("--format raw --sample-type ci16_le --rate 1e3 --receiver a:b", "`--receiver` may hold letters"),
+        ("--format raw --sample-type ci16_le --rate 1e3 --receiver a --receiver a", "`--receiver` names one twice"),
+        ("--rate 1e3", "--rate goes with --format raw or --format wav"),
+        ("--follow --until tomorrow", "`--until` must be a time such as"),
+    ],
+)
+def test_what_is_said_wrongly_of_raw_samples_is_told_in_options(tmp_path: Path, options: str, words: str) -> None:
+    (tmp_path / "a.iq").write_bytes(bytes(4000))
+    code, _, error = run("process", tmp_path / "a.iq", "-o", tmp_path / "r.h5", *options.split())
+    assert code == 3
+    assert error.startswith(f"rfpose: {words}")

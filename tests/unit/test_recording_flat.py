@@ -67,6 +67,14 @@ def test_raw_samples_that_are_not_declared_well(tmp_path):
         assert any("nothing says when it was recorded" in line for line in describe(r)["problems"])
 
 
+def test_raw_samples_that_begin_as_another_format_does(tmp_path):
+    declared = Declared(sample_type="ci16_le", sample_rate=Fraction(1000), start_s=Fraction(5))
+    for head, name in ((b"RIFF\0\0\0\0WAVEfmt ", "WAV"), (b"\x89HDF\r\n\x1a\n" + bytes(8), "HDF5")):
+        (tmp_path / "a.iq").write_bytes(head + bytes(4000))
+        with open_recording(tmp_path / "a.iq", declared=declared) as r:
+            assert r.doubts["a"] == [f"it begins as a file of {name} does, whose header is taken for samples"]
+
+
 def test_a_manifest_declares_raw_samples_beside_others(tmp_path):
     x = values(400)
     for k in range(2):
@@ -150,6 +158,32 @@ def test_wav_whose_times_do_not_fit_its_samples(tmp_path):
         assert r.time_known
         assert r.centre_frequency_hz == 2e8
         assert r.blocks("H01_r0").tolist() == [[START_S * RATE, 1000]]
+
+
+def test_wav_that_is_said_to_be_otherwise_than_its_header_says(tmp_path):
+    path = tmp_path / "a.wav"
+    path.write_bytes(wav(fmt(), auxi(), chunk(b"data", values(1000).astype("<i2").tobytes())))
+    declared = Declared(
+        format="wav", start_s=Fraction(START_S + 9), sample_rate=Fraction(96_000), centre_frequency_hz=2e8
+    )
+    with open_recording(path, declared=declared) as r:
+        assert (r.sample_rate, r.centre_frequency_hz) == (96_000, 2e8)
+        assert r.doubts["a"][:3] == [
+            "its header says 192000 samples/s; 96000 was given, and is taken",
+            "its header says that it was tuned to 100000000 Hz; 200000000 was given, and is taken",
+            "its header says that it began 8.75 s earlier than was given, which is taken",
+        ]
+    declared = Declared(format="wav", start_s=Fraction(START_S), sample_rate=Fraction(RATE), centre_frequency_hz=1e8)
+    with open_recording(path, declared=declared) as r:
+        assert not r.doubts
+    declared = Declared(format="wav", receiver_ids=("a", "b"))
+    with pytest.raises(RecordingError, match=r"has 1 receiver, but 2 are named; name as many as it has$"):
+        open_recording(path, declared=declared)
+    path.write_bytes(wav(fmt(rate=0), chunk(b"data", bytes(400))))
+    with pytest.raises(RecordingError, match=r"its header gives no rate: .*got 0; give it as `sample_rate=RATE`"):
+        open_recording(path)
+    with open_recording(path, declared=Declared(format="wav", sample_rate=Fraction(1000))) as r:
+        assert r.sample_rate == 1000
 
 
 def sparse(path, head, n_byte, tail=b""):

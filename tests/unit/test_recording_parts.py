@@ -287,6 +287,11 @@ def test_what_parts_say_of_themselves_is_told(tmp_path):
         assert r.full_scale == 32767
         assert "a.h5 does not say to what it was tuned, other parts do" in r.notes
         assert "parts have full scales from 2047 to 32767; samples that reach 32767 count as clipped" in r.notes
+    floats = write(
+        tmp_path / "f.h5", [("r2", 0, counts(9).astype(np.float32))], sample_format="complex64", full_scale=np.inf
+    )
+    with open_recording([coarse, floats]) as r:
+        assert "parts have full scales from 2047 to none; no sample counts as clipped" in r.notes
     # a WAV file that was cut, and a collection that lacks a stream
     samples = struct.pack("<4h", 1, 2, 3, 4)
     form = struct.pack("<HHIIHH", 1, 2, 1000, 4000, 4, 16)
@@ -391,6 +396,75 @@ def test_a_directory_of_parts(tmp_path):
     assert list(summary["parts"]) == ["a.h5", "b.h5"]
     assert summary["parts"]["b.h5"]["samples"] == 100
     assert summary["parts"]["b.h5"]["receivers"] == ["r0"]
+
+
+def test_a_recording_in_a_directory_that_is_cut_off_or_empty_is_named(tmp_path):
+    write(tmp_path / "a.h5", [("r0", 0, counts(1000))])
+    cut = write(tmp_path / "b.h5", [("r1", 0, counts(1000))])
+    cut.write_bytes(cut.read_bytes()[:700])
+    (tmp_path / "c.h5").write_bytes(b"")
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["x"] = 1
+    with open_recording(tmp_path) as r:
+        assert r.receiver_ids == ("r0",)
+        assert [note.split(":")[0] for note in r.notes] == ["left out"] * 2
+        assert "b.h5: the HDF5 file is truncated" in r.notes[0]
+        assert "c.h5: the file is empty" in r.notes[1]
+
+
+def sigmf_file(folder, name, samples, datatype="ci16_le", centre_hz=1e8):
+    (folder / f"{name}.sigmf-data").write_bytes(samples.tobytes())
+    meta = {
+        "global": {"core:datatype": datatype, "core:sample_rate": 1000, "core:version": "1.2.0"},
+        "captures": [
+            {"core:sample_start": 0, "core:datetime": "2026-09-21T14:13:20.000Z", "core:frequency": centre_hz}
+        ],
+        "annotations": [],
+    }
+    (folder / f"{name}.sigmf-meta").write_text(json.dumps(meta))
+
+
+def test_sigmf_recordings_of_other_types_in_one_directory(tmp_path):
+    x = counts(100)
+    sigmf_file(tmp_path, "r0", x)
+    sigmf_file(tmp_path, "r1", x.astype("<f4"), datatype="cf32_le")
+    sigmf_file(tmp_path, "r2", x, centre_hz=1.1e8)
+    with open_recording(tmp_path) as r:
+        assert r.receiver_ids == ("r0", "r1", "r2")
+        for name in r.receiver_ids:
+            assert np.array_equal(r.read(name, 1_790_000_000_000, 100), x)
+        assert r.tuning_of("r2") == 1.1e8
+    # beside others, and in a directory of its own among those that are given
+    alone = write(tmp_path / "a.h5", [("r3", 0, x)], sample_rate=Fraction(1000))
+    for given in (tmp_path, [tmp_path], [alone, tmp_path]):
+        with open_recording(given) as r:
+            assert set(r.receiver_ids) == {"r0", "r1", "r2", "r3"}
+
+
+def test_a_damaged_sigmf_recording_in_a_directory_is_named_and_the_rest_goes_on(tmp_path):
+    for name in ("r0", "r1", "r2"):
+        sigmf_file(tmp_path, name, counts(100))
+    (tmp_path / "r1.sigmf-meta").write_text("{")
+    (tmp_path / "r2.sigmf-data").unlink()
+    with open_recording(tmp_path) as r:
+        assert r.receiver_ids == ("r0",)
+        assert [note.split(":")[0] for note in r.notes] == ["left out"] * 2
+        assert "r1.sigmf-meta: not valid JSON" in r.notes[0]
+        assert "missing: `r2.sigmf-data`" in r.notes[1]
+
+
+def test_sigmf_recordings_beside_channels_of_digital_rf(tmp_path):
+    pytest.importorskip("digital_rf")
+    x = counts(100)
+    one = write(tmp_path / "one.h5", [("r0", 1_790_000_000_000 - START, x)], sample_rate=Fraction(1000))
+    convert(open_recording(one), tmp_path / "night", format="digital-rf")
+    sigmf_file(tmp_path / "night", "r1", x)
+    with open_recording(tmp_path / "night") as r:
+        assert r.receiver_ids == ("r0", "r1")
+        assert list(describe(r)["parts"]) == ["night/", "r1.sigmf-meta"]
+        assert r.notes == []
+        for name in r.receiver_ids:
+            assert np.array_equal(r.read(name, 1_790_000_000_000, 100), x)
 
 
 def manifest(folder, text):

@@ -130,15 +130,20 @@ def declared_options(function: F) -> F:
 
     @functools.wraps(function)
     def command(*args: Any, **given: Any) -> Any:
-        names = ("file_format", "sample_type", "rate", "start", "centre", "receiver")
+        names = ("file_format", "sample_type", "sample_rate", "start", "centre_frequency_hz", "receiver_ids")
         return function(*args, declared=_declared(**{name: given.pop(name) for name in names}), **given)
 
     added: Any = command
     for option in (
-        click.option("--receiver", multiple=True, help="With --format: the receiver's name; once for each, in order."),
-        click.option("--centre", help="With --format: radio frequency at baseband zero, Hz."),
+        click.option(
+            "--receiver",
+            "receiver_ids",
+            multiple=True,
+            help="With --format: the receiver's name; once for each, in order.",
+        ),
+        click.option("--centre", "centre_frequency_hz", help="With --format: radio frequency at baseband zero, Hz."),
         click.option("--start", help="With --format: when the first sample was taken, as 2026-09-21T14:00:00.123Z."),
-        click.option("--rate", help="With --format: samples a second, also as a fraction: 10000000/3."),
+        click.option("--rate", "sample_rate", help="With --format: samples a second, also as a fraction: 10000000/3."),
         click.option("--sample-type", help="With --format: ci8, cu8, ci16_le, ci16_be, ci32_le, cf32_le and so on."),
         click.option(
             "--format",
@@ -152,10 +157,21 @@ def declared_options(function: F) -> F:
 
 
 def _declared(
-    file_format: Any, sample_type: str | None, rate: str | None, start: str | None, centre: str | None, receiver: Any
+    file_format: Any,
+    sample_type: str | None,
+    sample_rate: str | None,
+    start: str | None,
+    centre_frequency_hz: str | None,
+    receiver_ids: Any,
 ) -> Declared | None:
-    """Return what the options say of files of samples; None where nothing is said."""
-    told = {"--sample-type": sample_type, "--rate": rate, "--start": start, "--centre": centre, "--receiver": receiver}
+    """Return what the options say of files of samples, by the library's names; None where nothing is said."""
+    told = {
+        "--sample-type": sample_type,
+        "--rate": sample_rate,
+        "--start": start,
+        "--centre": centre_frequency_hz,
+        "--receiver": receiver_ids,
+    }
     if file_format is None:
         if lone := [name for name, value in told.items() if value]:
             raise InvalidInputError(f"{lone[0]} goes with --format raw or --format wav")
@@ -163,14 +179,15 @@ def _declared(
     from rfpose.foreign import exact_number, exact_rate
     from rfpose.recording.declared import Declared, seconds_of
 
-    exact = None if rate is None else exact_number("rate", rate)
+    exact = None if sample_rate is None else exact_number("sample_rate", sample_rate)
+    centre = centre_frequency_hz
     return Declared(
         format=file_format,
         sample_type=sample_type,
-        sample_rate=None if exact is None else exact_rate("rate", exact),
+        sample_rate=None if exact is None else exact_rate("sample_rate", exact),
         start_s=None if start is None else seconds_of(start, "`start`"),
-        centre_frequency_hz=None if centre is None else float(exact_number("centre", centre)),
-        receiver_ids=tuple(receiver),
+        centre_frequency_hz=None if centre is None else float(exact_number("centre_frequency_hz", centre)),
+        receiver_ids=tuple(receiver_ids),
     )
 
 

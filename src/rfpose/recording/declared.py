@@ -121,7 +121,13 @@ def seconds_of(value: Any, name: str) -> Fraction:
             return parse_stamp(value, Fraction(1)).samples
         except InvalidInputError as error:
             raise InvalidInputError(f"{name}: {str(error).replace('`core:datetime` ', '')}") from error
-    found = exact_number(name.strip("`"), value)
+    try:
+        found = exact_number(name.strip("`"), value)
+    except InvalidInputError as error:
+        if not isinstance(value, str):
+            raise
+        wanted = "a time such as 2026-09-21T14:00:00.123Z, or seconds since 1970"
+        raise InvalidInputError(f"{name} must be {wanted}, got {value!r:.60}") from error
     if found < 0:
         raise InvalidInputError(f"{name} must not lie before 1970, got {float(found):g}")
     return Fraction(repr(value)) if isinstance(value, float) else found

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TypeAlias
 
-from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.kinds import COMPRESSED_SIGMF, SIGMF_ENDINGS, kind_of
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.heaps import open_hdf5
+from rfpose.kinds import COMPRESSED_SIGMF, SIGMF_ENDINGS, is_hdf5, kind_of
 from rfpose.recording.base import Recording
 from rfpose.recording.declared import Declared
 from rfpose.recording.gnuradio import GnuRadioRecording, is_gnuradio_header
@@ -88,6 +90,7 @@ def open_recording(
             found = _found_in(path)
             if found and found != [path]:
                 return _open_set(found, scenario=scenario, declared=None, follow_links=follow_links, whole=path)
+            return _open_folder(path, scenario, follow_links=follow_links)
     return _open_one(path, scenario, declared=declared, follow_links=follow_links)
 
 
@@ -138,6 +141,18 @@ def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | Non
     return NativeRecording(path, scenario=scenario, follow_links=follow_links)
 
 
+def _open_folder(path: Path, scenario: Scenario | None, *, follow_links: bool) -> Recording:
+    """Open a directory as one recording; of SigMF recordings that are unlike, or damaged, as their parts."""
+    try:
+        return _open_one(path, scenario, declared=None, follow_links=follow_links)
+    except RecordingError:
+        metas = _metas(path)
+        if len(metas) > 1:
+            with contextlib.suppress(RecordingError):  # if none can be read apart, why not as one is told
+                return _open_set(metas, scenario=scenario, declared=None, follow_links=follow_links, whole=path)
+        raise
+
+
 def _open_directory(path: Path, scenario: Scenario | None, *, follow_links: bool) -> Recording:
     if any(path.glob("*/drf_properties.h5")):
         from rfpose.recording.drf import DigitalRfRecording
@@ -162,7 +177,9 @@ def _found_in(path: Path) -> list[Path]:
     """Return the recordings in a directory: itself where it is one, files in it, directories in it that are one."""
     if (path / "drf_properties.h5").exists():
         return []
-    found = [path] if any(path.glob("*/drf_properties.h5")) or any(path.glob("*.sigmf-meta")) else []
+    is_drf, metas = any(path.glob("*/drf_properties.h5")), sorted(path.glob("*.sigmf-meta"))
+    found = [path] if is_drf or metas else []
+    found += metas if is_drf else []
     found += sorted(file for pattern in _IN_A_SET for file in path.glob(pattern) if _is_part(file))
     for folder in sorted(path.iterdir()):
         is_channel = (folder / "drf_properties.h5").exists()
@@ -177,7 +194,35 @@ def _is_part(file: Path) -> bool:
         return False
     if file.suffix == ".hdr":
         return is_gnuradio_header(file)
-    return file.suffix not in (".h5", ".hdf5") or kind_of(file) == "recording"
+    return file.suffix not in (".h5", ".hdf5") or kind_of(file) == "recording" or _is_cut_off(file)
+
+
+def _is_cut_off(file: Path) -> bool:
+    """Whether a file of HDF5 cannot be opened, or is empty: then it may have been a recording, and is named."""
+    if not is_hdf5(file):
+        return file.stat().st_size == 0
+    try:
+        with open_hdf5(file):
+            return False
+    except (OSError, RuntimeError):
+        return True
+
+
+def _apart(path: Path, *, follow_links: bool) -> list[Path]:
+    """Return a directory of SigMF recordings if they are read as one; else each: they are unlike, or damaged."""
+    metas = _metas(path)
+    if len(metas) > 1:
+        with contextlib.suppress(ScenarioError):  # of the scenario.toml beside them, which their reader tells
+            try:
+                _open_one(path, None, declared=None, follow_links=follow_links).close()
+            except RecordingError:
+                return metas
+    return [path]
+
+
+def _metas(path: Path) -> list[Path]:
+    """Return the SigMF recordings that a directory is read as, none where it is one of Digital RF."""
+    return [] if any(path.glob("*/drf_properties.h5")) else sorted(path.glob("*.sigmf-meta"))
 
 
 def _open_set(
@@ -196,7 +241,8 @@ def _open_set(
                 f"{path}: a manifest stands for a whole recording; give it alone, or write all into it"
             )
         inner = _found_in(path) if path.is_dir() and declared is None and path != whole else [path]
-        paths += inner or [path]
+        for one in inner or [path]:
+            paths += _apart(one, follow_links=follow_links) if one.is_dir() and declared is None else [one]
     paths = list(dict.fromkeys(paths))
     names = _short_names(paths, within=whole)
     parts = [Part(name=names[path], open=_opener(path, declared=declared, follow_links=follow_links)) for path in paths]
@@ -259,6 +305,7 @@ def _short_names(paths: Iterable[Path], *, within: Path | None) -> dict[Path, st
     """Return what to call parts: short, and each its own."""
     paths = list(paths)
     if within is not None:
-        return {path: str(path.relative_to(within)) if path.is_relative_to(within) else str(path) for path in paths}
+        inner = {path: str(path.relative_to(within)) for path in paths if path.is_relative_to(within)}
+        return {path: f"{path.name}/" if path == within else inner.get(path, str(path)) for path in paths}
     short = [path.name for path in paths]
     return {path: path.name if short.count(path.name) == 1 else str(path) for path in paths}

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import logging
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -286,9 +287,11 @@ class PartsRecording(Recording):
                 self.notes.append(f"{_some(silent)} does not say to what it was tuned, other parts do")
         scales = {known.recording.full_scale for known in self._known}
         if len(scales) > 1:
+            most = max(scales)
             self.notes.append(
-                f"parts have full scales from {min(scales):g} to {max(scales):g}; samples that reach {max(scales):g} "
-                "count as clipped"
+                f"parts have full scales from {min(scales):g} to {most:g}; samples that reach {most:g} count as clipped"
+                if math.isfinite(most)
+                else f"parts have full scales from {min(scales):g} to none; no sample counts as clipped"
             )
 
     def _laid_out(self, receiver_id: str) -> list[_Stretch]:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from rfpose.errors import RecordingError
+from rfpose.kinds import is_hdf5
 from rfpose.recording.declared import Declared
 from rfpose.recording.flat import FlatRecording, FlatStream
 from rfpose.recording.sidecar import receiver_name
 from rfpose.recording.stamps import LARGEST_INDEX
+from rfpose.recording.wav import is_wav
 from rfpose.scenario import Scenario
 
 __all__ = ["RawRecording"]
@@ -37,6 +39,8 @@ class RawRecording(FlatRecording):
             raise RecordingError(f"{path}: would end at sample {start + n_sample}, more than 64 bits can count")
         segments = np.array([[start, n_sample, 0]] if n_sample else [], np.int64).reshape(-1, 3)
         untimed = [] if declared.start_s is not None else ["nothing says when it was recorded; say so with `start`"]
+        other = "HDF5" if is_hdf5(path) else "WAV" if is_wav(path) else None
+        foreign = [] if other is None else [f"it begins as a file of {other} does, whose header is taken for samples"]
         streams = {
             name: FlatStream(
                 file=path,
@@ -44,7 +48,7 @@ class RawRecording(FlatRecording):
                 segments=segments,
                 channels=len(names),
                 channel=k,
-                doubts=untimed,
+                doubts=foreign + untimed,
                 time_known=not untimed,
             )
             for k, name in enumerate(names)

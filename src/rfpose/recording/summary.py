@@ -161,7 +161,12 @@ def describe(recording: Recording) -> dict[str, Any]:
         found += _disagreements(recording, scenario)
         missing = [name for name in scenario.receiver_ids if name not in recording.receiver_ids]
         if missing:
-            found.append(f"{len(missing)} receivers of the scenario are not in the recording: {_some(missing)}")
+            number = (
+                "1 receiver of the scenario is"
+                if len(missing) == 1
+                else f"{len(missing)} receivers of the scenario are"
+            )
+            found.append(f"{number} not in the recording: {_some(missing)}")
         summary["receivers_not_in_scenario"] = [
             name for name in recording.receiver_ids if name not in scenario.receiver_ids
         ]

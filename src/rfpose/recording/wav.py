@@ -44,6 +44,8 @@ _LEAP_SECONDS: Final = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800
 _FRESH_S: Final = 60
 """KiwiSDR's stamp is used if its receiver's last solution is no older [s]; 255 means that there was none."""
 _NAME_AGREES_S: Final = 5
+_RATE_AGREES: Final = Fraction(1, 1000)
+_START_AGREES_S: Final = 1
 _KIWI_NAME: Final = re.compile(r"(\d{8}T\d{6})Z_(\d+)(?:_(.+?))?_iq", re.ASCII)
 
 
@@ -54,11 +56,12 @@ class _Chunk(NamedTuple):
 
 
 class _Form(NamedTuple):
-    """What the chunk ``fmt`` says."""
+    """What the chunk ``fmt`` says, and what is said in its place."""
 
     type: SampleType
     n_receiver: int
     rate: Fraction
+    header_hz: int
 
 
 @dataclass(slots=True)
@@ -98,7 +101,7 @@ class WavRecording(FlatRecording):
                 raise
             raise RecordingError(f"{path}: cannot read: {error.strerror or error}; check the file") from error
         except InvalidInputError as error:
-            raise RecordingError(f"{path}: {error}; record it again, or say so with `declared`") from error
+            raise RecordingError(f"{path}: {error}") from error
         try:
             streams = _streams(path, form, found, declared)
         except InvalidInputError as error:
@@ -188,9 +191,18 @@ def _form(path: Path, file: BinaryIO, chunks: Sequence[_Chunk], declared: Declar
     if width != n_channel * bits // 8 or kind.sample_bytes * n_channel != 2 * width:
         raise RecordingError(f"{path}: {n_channel} channels of {bits} bits do not take {width} bytes; copy it again")
     if declared.receiver_ids and len(declared.receiver_ids) != n_channel // 2:
-        raise InvalidInputError(f"has {n_channel // 2} receivers, {len(declared.receiver_ids)} are named")
-    exact = declared.sample_rate if declared.sample_rate is not None else exact_rate("sample rate", rate)
-    return _Form(kind, n_channel // 2, exact)
+        n_receiver = n_channel // 2
+        raise InvalidInputError(
+            f"has {n_receiver} receiver{'' if n_receiver == 1 else 's'}, but {len(declared.receiver_ids)} are named; "
+            "name as many as it has"
+        )
+    exact = declared.sample_rate
+    if exact is None:
+        try:
+            exact = exact_rate("sample rate", rate)
+        except InvalidInputError as error:
+            raise InvalidInputError(f"its header gives no rate: {error}; give it as `sample_rate=RATE`") from error
+    return _Form(kind, n_channel // 2, exact, rate)
 
 
 # -- samples and times ---------------------------------------------------------------------------------------
@@ -311,11 +323,28 @@ def _name_seconds(text: str) -> int | None:
         return None
 
 
+def _otherwise(form: _Form, found: _Read, declared: Declared) -> list[str]:
+    """Return where what was given contradicts the header; a rate may be known better than in whole numbers."""
+    doubts = []
+    if form.header_hz and abs(form.rate - form.header_hz) > _RATE_AGREES * form.rate:
+        doubts.append(f"its header says {form.header_hz} samples/s; {float(form.rate):.12g} was given, and is taken")
+    tuned, given = found.centre_frequency_hz, declared.centre_frequency_hz
+    if tuned is not None and given is not None and tuned != given:
+        doubts.append(f"its header says that it was tuned to {tuned:.12g} Hz; {given:.12g} was given, and is taken")
+    stamp = found.captures[0][0].stamp
+    if stamp is not None and declared.start_s is not None:
+        later_s = float(declared.start_s - stamp.samples / form.rate)
+        if abs(later_s) > _START_AGREES_S:
+            beside = "earlier" if later_s > 0 else "later"
+            doubts.append(f"its header says that it began {abs(later_s):.6g} s {beside} than was given, which is taken")
+    return doubts
+
+
 def _streams(path: Path, form: _Form, found: _Read, declared: Declared) -> dict[str, FlatStream]:
     """Lay the captures out in time, the same for all receivers of the file."""
     first = next((i for i, (capture, _, _) in enumerate(found.captures) if capture.stamp is not None), None)
     captures = [capture for capture, _, _ in found.captures]
-    doubts = list(found.doubts)
+    doubts = [*found.doubts, *_otherwise(form, found, declared)]
     time_known = True
     if declared.start_s is not None:
         given = Stamp(samples=declared.start_s * form.rate, resolution=Fraction(1))
