@@ -367,6 +367,54 @@ def test_a_track_is_that_of_one_process_whoever_began_it(
         run("unseen.h5", there)
 
 
+def test_a_method_that_learns_is_kept_day_by_day_whoever_dies(
+    cluster: distributed.LocalCluster, tmp_path: Path
+) -> None:
+    from rfpose.pipeline.track import track
+
+    hours = {"first_hour": 9.0, "last_hour": 9.2, "days": 4, "field_control": None, "event": None}
+    site = load_scenario(ROOT / "data" / "tracking_100m.toml").changed(tracking=hours)
+    (tmp_path / "site.toml").write_text(site.to_toml())
+    job = partial(track, tmp_path / "site.toml", methods=("radio-both", "encoder"), heliostats=2)
+    there = Engine(scheduler=cluster.scheduler_address)
+    _done(Engine(), partial(job, tmp_path / "alone.h5"))
+    _done(there, partial(job, tmp_path / "r.h5"))
+    wanted = (tmp_path / "alone.h5").read_bytes()
+    assert (tmp_path / "r.h5").read_bytes() == wanted
+    # the client is killed when the second day of it is there, and a worker in what follows
+    code = f"""
+import os, signal
+from rfpose.engine import Engine
+from rfpose.pipeline import track
+plain = track.Checkpoint.write
+def write(self, state, **how):
+    plain(self, state, **how)
+    if state["radio-both/over"].sum() == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+track.Checkpoint.write = write
+with Engine(scheduler={cluster.scheduler_address!r}).used():
+    track.track("site.toml", "k.h5", methods=("radio-both", "encoder"), heliostats=2, checkpoint_s=0.0)
+"""
+    killed = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert not (tmp_path / "k.h5").exists()
+    with np.load(tmp_path / ".k.h5.state") as state:
+        assert state["radio-both/over"].tolist() == [True, True, False, False]
+    told: list[int] = []
+    pids = _worker_pids(cluster.scheduler_address)
+
+    def on_progress(done: int, _total: int) -> None:
+        told.append(done)
+        if pids:
+            os.kill(pids.pop(), signal.SIGKILL)
+            pids.clear()
+
+    _done(there, partial(job, tmp_path / "k.h5", on_progress=on_progress))
+    assert (tmp_path / "k.h5").read_bytes() == wanted
+    assert told[0] > 2  # stretches: a day has one, and two of each method were kept at least
+    assert told[-1] == 8
+
+
 def test_wrong_choices_are_refused(recording: Path) -> None:
     with pytest.raises(InvalidInputError, match="give one of the two"):
         Engine(scheduler="tcp://host:8786", workers=2)

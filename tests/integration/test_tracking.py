@@ -155,23 +155,37 @@ def test_a_restored_run_goes_on_as_if_nothing_had_happened(default_hour):
 
 def test_days_and_methods_simulated_apart_are_those_of_one_run():
     # hidden transmitters: their draws are radio's alone, and a portion without radio lacks them
-    site = scenario(days=2, last_hour=9.3, radio={"hidden_transmitters": 0.1})
+    site = scenario(days=3, last_hour=9.3, radio={"hidden_transmitters": 0.1})
     methods = ("open-loop", "encoder", "radio-both")
     whole = run(site, methods, count=2)
+    state = whole.state()
+    for learned in ("model", "cov"):
+        np.testing.assert_array_equal(state[f"radio-both/evening/{learned}"], state[f"radio-both/{learned}"])
     parts = TrackingSimulation(site, methods=methods, count=2, seed=1)
     for _ in range(3):  # a day and half of the next, which begins again
         parts.advance()
+    assert parts.n_over == 3 * 2
     portions = parts.portions(4)
-    assert [(p.methods, p.first_day, p.end_day) for p in portions] == [
-        (("radio-both",), 0, 2), (("open-loop",), 1, 2), (("encoder",), 1, 2),
+    assert [(p.methods, p.i_day) for p in portions] == [
+        (("radio-both",), 1), (("open-loop",), 1), (("encoder",), 1), (("open-loop",), 2), (("encoder",), 2),
     ]  # fmt: skip
-    found = {p: TrackingSimulation(site, methods=p.methods, count=2, seed=1).go_through(p) for p in portions[::-1]}
-    for portion in portions[1:]:
+
+    def apart(portion):
+        return TrackingSimulation(site, methods=portion.methods, count=2, seed=1).go_through(
+            portion, parts.learned(portion)
+        )
+
+    found = {p: apart(p) for p in portions[::-1]}
+    assert [later for p in portions[1:] for later in parts.following(p)] == []
+    for portion in portions:
         parts.take(portion, found[portion])
     rest = TrackingSimulation(site, methods=methods, count=2, seed=1)
     rest.restore({name: values.copy() for name, values in parts.state().items()})
-    parts.take(portions[0], found[portions[0]])
-    assert parts.portions(4) == []
+    (last,) = parts.following(portions[0])
+    assert parts.portions(4) == [last]
+    parts.take(last, apart(last))
+    assert parts.portions(4) == parts.following(last) == []
+    assert parts.n_over == 3 * 6
     while rest.done < rest.n_segment:
         rest.advance()
     for name in methods:

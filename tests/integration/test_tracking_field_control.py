@@ -1,5 +1,6 @@
 """Fields tracked under field control: stow to stow, by messages, through events, calibrations, interruptions."""
 
+import dataclasses
 import datetime
 import io
 from pathlib import Path
@@ -603,6 +604,32 @@ def test_killed_and_taken_up_again_nothing_changes(events, amid):
     same_bytes(second.state(), whole.state())
     assert second.happened("open-loop") == whole.happened("open-loop")
     assert whole.n_segment == 2
+
+
+def test_days_of_a_method_that_learns_go_from_hand_to_hand():
+    """Each day by another simulation, told what was learned, and what a homing has made worthless overnight."""
+    site = scenario(
+        {"first_hour": 11.5, "last_hour": 11.8, "days": 3, "store_interval_s": 60.0},
+        {"field_control": {"homing_sigma_mrad": 5.0}},
+        events=("11.52 counts-lost H01", "11.53 zero-counts H01"),
+    )  # fmt: skip
+    whole = run(site, ("radio-both",))
+    relay = TrackingSimulation(site, methods=("radio-both",), count=3, seed=1)
+    (portion,) = relay.portions(2)
+    for i_day in range(3):
+        assert portion.i_day == i_day
+        other = TrackingSimulation(site, methods=("radio-both",), count=3, seed=1)
+        relay.take(portion, other.go_through(portion, relay.learned(portion)))
+        kept = through_a_file(relay.state())
+        relay = TrackingSimulation(site, methods=("radio-both",), count=3, seed=1)
+        relay.restore(kept)
+        (portion,) = relay.portions(2) or [None]
+    homed = next(values for name, values in kept.items() if name.endswith("/homed"))
+    assert homed.tolist() == [True, False, False]
+    assert relay.happened("radio-both") == whole.happened("radio-both")
+    for results in (TrackingSimulation.sums, TrackingSimulation.curves):
+        mine, wanted = (dataclasses.asdict(results(each, "radio-both")) for each in (relay, whole))
+        same_bytes(mine, wanted)
 
 
 def test_same_seed_same_bytes_and_company_makes_no_difference(emergency):

@@ -18,6 +18,7 @@ from rfpose.scenario import Scenario, naming, scenario_of
 
 if TYPE_CHECKING:
     from rfpose.feedback.tracking import Portion, TrackingSimulation
+    from rfpose.feedback.tracking.engine import Arrays
     from rfpose.pipeline.formats.track_file import Track
 
 __all__ = ["TrackChanges", "track"]
@@ -45,6 +46,8 @@ class TrackChanges:
 
 
 _AS_IT_STANDS = TrackChanges()
+_KEEPING = 0.02
+"""Of the time of others, so much may go into keeping what each result adds: it is a day, which took them long."""
 
 
 def track(
@@ -143,7 +146,7 @@ def track(
         )
         for done, total in run:
             if checkpoint is not None:
-                checkpoint.write(simulation.state())
+                checkpoint.write(simulation.state(), share=_KEEPING if is_elsewhere() else 0.0)
             if on_progress is not None:
                 on_progress(done, total)
         found = track_of(simulation, settings, iq=iq)
@@ -187,18 +190,34 @@ class _Job:
 
 def _run_elsewhere(simulation: TrackingSimulation, job: _Job) -> Iterator[tuple[int, int]]:
     """Let others simulate; yield (stretches done, stretches in all), each method's counted."""
+    total = simulation.n_segment * len(simulation.methods)
     with team_of() as team:
-        portions = simulation.portions(team.n_at_once)
-        total = simulation.n_segment * len(simulation.methods)
-        done = total - sum(map(simulation.n_segment_of, portions))
-        for i, found in team.map(_simulate_there, portions, job):
-            simulation.take(portions[i], found)
-            done += simulation.n_segment_of(portions[i])
-            yield done, total
+        waiting = simulation.portions(team.n_at_once)
+        given: list[tuple[Portion, Mapping[str, Arrays]]] = []
+        under_way: set[Portion] = set()
+
+        def give_out() -> None:
+            # while a method learns, no more than runs side by side: its next day would have to wait for all of them
+            learns = any(portion.learns for portion in (*waiting, *under_way))
+            n = max(team.n_at_once - len(under_way), 0) if learns else len(waiting)
+            given.extend((portion, simulation.learned(portion)) for portion in waiting[:n])
+            under_way.update(waiting[:n])
+            del waiting[:n]
+
+        give_out()
+        for i, found in team.map(_simulate_there, given, job):
+            portion, _ = given[i]
+            given[i] = portion, {}
+            simulation.take(portion, found)
+            under_way.remove(portion)
+            waiting[:0] = simulation.following(portion)
+            give_out()
+            yield simulation.n_over, total
 
 
-def _simulate_there(job: _Job, portion: Portion) -> Any:
-    """Simulate a portion on a worker."""
+def _simulate_there(job: _Job, given: tuple[Portion, Mapping[str, Arrays]]) -> Any:
+    """Simulate a portion on a worker, which goes on from what its methods have learned."""
+    portion, learned = given
     from rfpose.feedback.tracking import TrackingSimulation
 
     tracking = job.scenario.tracking
@@ -209,7 +228,7 @@ def _simulate_there(job: _Job, portion: Portion) -> Any:
                 "everywhere"
             )
     simulation = TrackingSimulation(job.scenario, methods=portion.methods, count=job.heliostats, seed=job.seed)
-    return simulation.go_through(portion)
+    return simulation.go_through(portion, learned)
 
 
 def _digest(path: str) -> str:

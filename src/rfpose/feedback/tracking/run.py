@@ -140,6 +140,13 @@ class MethodRun:
         self.mode = np.full((n_time, n_kept), -1, np.int8)
         self.happened: list[dict[str, Any] | None] = [None] * n_day
         self._operation: Operation | None = None
+        # what a method that learns takes from one day to the next: a day under way can be begun again
+        n_learned = n if method.learns and n_day > 1 else 0
+        self._evening: Arrays = {
+            "model": self.engine.model[:n_learned].copy(),
+            "cov": self.engine.cov[:n_learned].copy(),
+            "homed": np.zeros(n_learned, np.bool_),
+        }
 
     # -- days ----------------------------------------------------------------------------------------------
 
@@ -150,17 +157,15 @@ class MethodRun:
         for name in _BY_DAY:
             getattr(self, name)[i_day] = 0.0
         engine.rest(plant.first_count(day))
-        # overnight counts are referenced anew; what was learned of counts that homing moved is worth nothing then
-        homed = np.zeros(len(plant.field), np.bool_)
-        if self._operation is not None:
-            homed[:] = self._operation.homing_rad.any(axis=1)
         self._operation = self._operate(i_day)
         if self._operation is not None:
             self._operation.park(engine.state)
         if not self._method.learns or i_day == 0:
             engine.model[:] = self._calibrator.model(self._method, day)
             return
+        engine.model[:], engine.cov[:], homed = self._evening.values()
         engine.grow_old(day.since_first - plant.days[i_day - 1].since_first)
+        # overnight counts are referenced anew; what was learned of counts that homing moved is worth nothing then
         if homed.any():
             engine.begin_anew(homed, self._calibrator.model(self._method, day))
 
@@ -205,6 +210,9 @@ class MethodRun:
             if operation is not None:
                 operation.end()
                 self.happened[segment.i_day] = {"day": str(day.date)} | operation.report()
+            if len(self._evening["homed"]):
+                self._evening["model"][:], self._evening["cov"][:] = engine.model, engine.cov
+                self._evening["homed"][:] = operation is not None and operation.homing_rad.any(axis=1)
 
     # -- results -------------------------------------------------------------------------------------------
 
@@ -240,7 +248,7 @@ class MethodRun:
         """Return what whole days gave, of a run that went through no others; ``times``: those of its courses."""
         found = {name: getattr(self, name)[days] for name in _BY_DAY}
         found |= {name: getattr(self, name)[times] for name in _BY_TIME}
-        return found | {"histogram": self.histogram, "happened": _as_array(self.happened[days])}
+        return found | {"histogram": self.histogram, "happened": _as_array(self.happened[days])} | self.evening()
 
     def put(self, days: slice, times: slice, part: Mapping[str, npt.NDArray[Any]]) -> None:
         """Take over what `part` gave elsewhere."""
@@ -248,7 +256,17 @@ class MethodRun:
             for name in names:
                 getattr(self, name)[at] = part[name]
         self.histogram += part["histogram"]
+        self.resume_from(part)
         self.happened[days] = _from_array(part["happened"])
+
+    def evening(self) -> Arrays:
+        """Return what the method takes from its last day that is over to the next, by name; of no mirror if nothing."""
+        return {f"evening/{name}": values for name, values in self._evening.items()}
+
+    def resume_from(self, evening: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from what `evening` gave, with the next day."""
+        for name, values in self._evening.items():
+            values[...] = evening[f"evening/{name}"]
 
     def drop_today(self) -> None:
         """Forget the day under way; the next to be gone through begins."""
@@ -257,7 +275,7 @@ class MethodRun:
     # -- interruption --------------------------------------------------------------------------------------
 
     def _own_arrays(self) -> Arrays:
-        return self.engine.arrays() | {name: getattr(self, name) for name in _ARRAYS}
+        return self.engine.arrays() | {name: getattr(self, name) for name in _ARRAYS} | self.evening()
 
     def arrays(self) -> Arrays:
         """Return all that going on depends on, by name."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,11 +32,11 @@ SEGMENT_S = 900.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Portion:
-    """Days of some methods, from ``first_day`` to before ``end_day``, which depend on no others."""
+    """A day of some methods; those of one that learns go on from what `TrackingSimulation.learned` tells."""
 
     methods: tuple[str, ...]
-    first_day: int
-    end_day: int
+    i_day: int
+    learns: bool = False
 
 
 class TrackingSimulation:
@@ -86,8 +85,7 @@ class TrackingSimulation:
                 who_of(event, self.field, plan.field_control.bus.cluster_size)
         calibrator = Calibrator(self.plant, self.radio)
         kept = KeptCourses(stored=self.stored, stride=self._stride)
-        self._new_run = {m.name: partial(MethodRun, m, self.plant, calibrator, kept) for m in self.methods}
-        self._runs = {name: new() for name, new in self._new_run.items()}
+        self._runs = {m.name: MethodRun(m, self.plant, calibrator, kept) for m in self.methods}
         self._over = {name: np.zeros(len(self.days), np.bool_) for name in self._runs}
         self._gust_state = self.plant.gusts.process.start(generator(self.plant.seed, 1, 0), n)
         self._beside = ThreadPoolExecutor(1, "rfpose-wind")
@@ -202,34 +200,47 @@ class TrackingSimulation:
     # -- by several ----------------------------------------------------------------------------------------
 
     def portions(self, n_at_once: int) -> list[Portion]:
-        """Return what is left in portions for so many workers, the longest first; a day under way begins again.
+        """Return what can be begun, in portions for so many workers, who learn first; a day under way begins anew.
 
-        A method that learns takes its model from day to day and is one portion. Days of the others depend on nothing
-        but the seed; where there are fewer days than workers, their methods are shared out, too.
+        A method that learns takes its model from day to day: of it there is the next day alone, see `following`. Days
+        of the others depend on nothing but the seed; where there are fewer days than workers, their methods are shared
+        out, too.
         """
         self.done, n_day, learning, days = 0, len(self.days), [], []
         for method in self.methods:
             self._runs[method.name].drop_today()
             if method.learns and not self._over[method.name].all():
-                self._runs[method.name] = self._new_run[method.name]()
-                self._over[method.name][:] = False
-                learning.append(Portion(methods=(method.name,), first_day=0, end_day=n_day))
+                learning.append(
+                    Portion(methods=(method.name,), i_day=int(self._over[method.name].argmin()), learns=True)
+                )
         for i_day in range(n_day):
             left = [m.name for m in self.methods if not m.learns and not self._over[m.name][i_day]]
             n_group = min(len(left), max(1, -(-n_at_once // n_day)))
             groups = (tuple(left[i::n_group]) for i in range(n_group))
-            days += [Portion(methods=group, first_day=i_day, end_day=i_day + 1) for group in groups]
+            days += [Portion(methods=group, i_day=i_day) for group in groups]
         return learning + days
 
-    def n_segment_of(self, portion: Portion) -> int:
-        """Return how many stretches a portion's days have, counted once a method."""
-        n = sum(portion.first_day <= segment.i_day < portion.end_day for segment in self.segments)
-        return n * len(portion.methods)
+    def following(self, portion: Portion) -> list[Portion]:
+        """Return what can be begun when a portion was taken: the next day of a method that learns."""
+        goes_on = portion.learns and portion.i_day + 1 < len(self.days)
+        return [replace(portion, i_day=portion.i_day + 1)] if goes_on else []
 
-    def go_through(self, portion: Portion) -> dict[str, Arrays]:
+    def learned(self, portion: Portion) -> dict[str, Arrays]:
+        """Return what a portion's methods know from the day before, for `go_through`; it does not change any more."""
+        evenings = {name: self._runs[name].evening() for name in portion.methods}
+        return {name: {k: v.copy() for k, v in arrays.items()} for name, arrays in evenings.items()}
+
+    @property
+    def n_over(self) -> int:
+        """Number of stretches of days that are over, counted once a method."""
+        return sum(int(over[segment.i_day]) for over in self._over.values() for segment in self.segments)
+
+    def go_through(self, portion: Portion, learned: Mapping[str, Mapping[str, npt.NDArray[Any]]]) -> dict[str, Arrays]:
         """Simulate a portion, of a simulation of its methods alone, and return what `take` wants."""
-        self.done = next(i for i, segment in enumerate(self.segments) if segment.i_day == portion.first_day)
-        while self.done < self.n_segment and self.segments[self.done].i_day < portion.end_day:
+        for name in portion.methods:
+            self._runs[name].resume_from(learned[name])
+        self.done = next(i for i, segment in enumerate(self.segments) if segment.i_day == portion.i_day)
+        while self.done < self.n_segment and self.segments[self.done].i_day == portion.i_day:
             self.advance()
         return {name: self._runs[name].part(*self._place_of(portion)) for name in portion.methods}
 
@@ -241,10 +252,10 @@ class TrackingSimulation:
             self._over[name][days] = True
 
     def _place_of(self, portion: Portion) -> tuple[slice, slice]:
-        """Return a portion's days, and its times among all instants kept."""
+        """Return a portion's day, and its times among all instants kept."""
         ends = np.cumsum([0, *(-(-len(day.unix_s) // self._stride) for day in self.days)])
-        days = slice(portion.first_day, portion.end_day)
-        return days, slice(int(ends[days.start]), int(ends[days.stop]))
+        i = portion.i_day
+        return slice(i, i + 1), slice(int(ends[i]), int(ends[i + 1]))
 
     # -- results -------------------------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ class Checkpoint:
 
     def __init__(self, path: Path, key: Mapping[str, str], *, restart: bool, interval_s: float = 20.0) -> None:
         self._path, self._key, self._interval_s = path, dict(key), interval_s
-        self._last = time.monotonic()
+        self._last, self._took_s = time.monotonic(), 0.0
         if restart:
             self.remove()
 
@@ -70,14 +70,17 @@ class Checkpoint:
             )
         return arrays
 
-    def write(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Keep a state, if the last one was kept long enough ago."""
-        if time.monotonic() - self._last < self._interval_s:
+    def write(self, state: Mapping[str, npt.NDArray[Any]], *, share: float = 0.0) -> None:
+        """Keep a state if the last was kept long enough ago, or if that took less than a share of the time since."""
+        began = time.monotonic()
+        since = began - self._last
+        if since < self._interval_s and self._took_s >= share * since:
             return
         buffer = io.BytesIO()
         np.savez(buffer, **{**state, _KEY: np.array(json.dumps(self._key, sort_keys=True))})  # type: ignore[arg-type]
         replace_content(self._path, buffer.getvalue())
         self._last = time.monotonic()
+        self._took_s = self._last - began
 
     def remove(self) -> None:
         """Forget the state."""
