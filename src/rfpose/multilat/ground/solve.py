@@ -218,12 +218,21 @@ def _behind(places: FloatArray, pivot: FloatArray, rot: FloatArray, reflectors: 
 
 def turns() -> FloatArray:
     """Rotation vectors spread over a ball, small ones first; none at all is first of all."""
-    from scipy.stats import qmc  # takes a second to load, and only this needs it
-
-    cube = 2.0 * qmc.Halton(3, scramble=False).random(_N_TURN) - 1.0
+    cube = 2.0 * _halton(_N_TURN) - 1.0
     length = np.linalg.norm(cube, axis=1)
     inside = length <= 1.0
     return np.concatenate([NO_TURN, _TURN_RAD * cube[inside][np.argsort(length[inside])]])
+
+
+def _halton(n: int) -> FloatArray:
+    """Return Halton's first points in the unit cube (point, 3): scipy has them in a module that takes long to load."""
+    out = np.zeros((n, 3))
+    for axis, base in enumerate((2, 3, 5)):
+        rest, worth = np.arange(n), 1.0 / base
+        while rest.any():  # digits of the point's number, mirrored at the point
+            out[:, axis] += rest % base * worth
+            rest, worth = rest // base, worth / base
+    return out
 
 
 def _direct_probability(problem: GroundProblem, start: RigidFits) -> FloatArray:
