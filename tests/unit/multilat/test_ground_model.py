@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
 from rfpose.errors import GeometryError, InvalidInputError
 from rfpose.multilat.ground import Reflector, Surface, fresnel_coefficient, range_shift_m
+from rfpose.multilat.ground.solve import turns
 
 SPEED = 299_792_458.0
 TRANSMITTER = np.array([[100.0, 0.0, 20.0], [-50.0, 86.6, 30.0]])
@@ -122,3 +124,13 @@ def test_transmitter_behind_the_reflector_is_refused_with_the_remedy():
 def test_bad_reflectors_are_refused_in_words(build, words):
     with pytest.raises(InvalidInputError, match=words):
         build()
+
+
+def test_turns_to_begin_from_are_those_of_haltons_sequence():
+    cube = 2.0 * qmc.Halton(3, scramble=False).random(200) - 1.0
+    inside = cube[np.linalg.norm(cube, axis=1) <= 1.0]
+    found = turns()
+    np.testing.assert_array_equal(found[0], 0.0)
+    np.testing.assert_array_equal(np.diff(np.linalg.norm(found, axis=1)) >= 0.0, True)
+    scale = np.linalg.norm(found[-1]) / np.linalg.norm(inside, axis=1).max()
+    np.testing.assert_allclose(np.sort(found[1:], axis=0), np.sort(scale * inside, axis=0), atol=1e-15)

@@ -157,7 +157,8 @@ class Heliostats:
         """Take sun angles over, unless they are further from fresh ones than the sun moves."""
         age = said_s - self.sun_s[index]
         farthest = self.settings.sun_jump_rad + EARTH_RADPS * age
-        step = np.sqrt(((sun_enu - self.sun_enu[index]) ** 2).sum(axis=1))
+        east, north, up = (sun_enu - self.sun_enu[index]).T
+        step = np.sqrt(east * east + north * north + up * up)
         ok = (step <= farthest) | ~(age <= fresh_s)
         if not ok.all():
             index, sun_enu = index[ok], np.broadcast_to(sun_enu, (len(ok), 3))[ok]

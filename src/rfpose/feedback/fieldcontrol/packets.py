@@ -234,13 +234,12 @@ def forge(raw: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[n
 def counts_from_angles(angle_rad: npt.ArrayLike) -> npt.NDArray[np.uint16]:
     """Return axis angles [rad] as sixteen-bit counts, whole turns dropped; the last half count is rounded."""
     turns = np.asarray(angle_rad, np.float64) / RESOLUTION_RAD
-    return (np.rint(turns).astype(np.int64) & 0xFFFF).astype(np.uint16)
+    return np.rint(turns).astype(np.int64).astype(np.uint16)
 
 
 def angles_from_counts(count: npt.ArrayLike) -> FloatArray:
     """Return the axis angles of sixteen-bit counts, in [−π, π) [rad]."""
-    signed = np.asarray(count).astype(np.uint16).astype(np.int32)
-    return np.asarray(np.where(signed >= 32768, signed - 65536, signed) * RESOLUTION_RAD)
+    return np.asarray(np.asarray(count).astype(np.uint16).astype(np.int16) * RESOLUTION_RAD)
 
 
 def step_counts_payload(index: int, azimuth_count: int, elevation_count: int) -> bytes:

@@ -229,8 +229,9 @@ class Wire:
     def _hear_answer(self, index: npt.NDArray[np.int64], at_s: FloatArray, now_s: float) -> None:
         """Take a report over; an order that was obeyed or refused is done with."""
         self.reported_mode[index] = self.heliostats.mode[index]
-        axis = np.nan_to_num(self.heliostats.axis_rad[index])
-        self.reported_axis_rad[index] = packets.angles_from_counts(packets.counts_from_angles(axis))
+        axis = self.heliostats.axis_rad[index]
+        known = np.where(np.isnan(axis), 0.0, axis)
+        self.reported_axis_rad[index] = packets.angles_from_counts(packets.counts_from_angles(known))
         self.reported_s[index] = at_s
         self.pending[index[self.done[index]]] = NOTHING
 

@@ -202,7 +202,7 @@ class Operation:
         orders = words[0]
         mode = orders.mode.astype(np.int64)
         follows = _FOLLOWS[mode] & np.isfinite(orders.sun_enu).all(axis=1)
-        duty = np.where(follows, np.where(mode == Mode.POINT, _kernels.FOLLOW, _kernels.TRACK), _kernels.GO)
+        duty = np.where(follows, np.where(mode == int(Mode.POINT), _kernels.FOLLOW, _kernels.TRACK), _kernels.GO)
         aim = np.where(follows[:, None], orders.aim_enu_m, self._field.target[:, :3])
         goal = (orders.target_axis_rad - self._home) * self._per_rad
         # who has not heard of the sun yet stands
@@ -233,7 +233,7 @@ class Operation:
     def _aim_axis_rad(self, s: int, state: FloatArray, model: FloatArray) -> FloatArray:
         """Where mirrors on approach have to go, by their method's model; NaN for the others."""
         axis = np.full((len(state), 2), np.nan)
-        index = np.flatnonzero(self.control.mode == Mode.APPROACH)
+        index = np.flatnonzero(self.control.mode == int(Mode.APPROACH))
         if index.size:
             count, _ = aim_count(
                 model[index], self._field.constant[index], self._day.sun_enu[s], self._field.target[index]
@@ -253,8 +253,8 @@ class Operation:
         if s > self._works_until:
             self._order(ModeEvent.STOW, free & ~np.isin(reported, _BACK))
         elif not self.control.alarms:
-            self._order(ModeEvent.APPROACH, free & self._out & (reported == Mode.STOW))
-            self._order(ModeEvent.STOW, free & self._out & (reported == Mode.IDLE))
+            self._order(ModeEvent.APPROACH, free & self._out & (reported == int(Mode.STOW)))
+            self._order(ModeEvent.STOW, free & self._out & (reported == int(Mode.IDLE)))
 
     def _order(self, command: ModeEvent, to: npt.NDArray[np.bool_]) -> None:
         if to.any():
@@ -300,7 +300,7 @@ class Operation:
 
     def _home_counts(self, mode: npt.NDArray[np.int8], state: FloatArray, s: int) -> None:
         """Mirrors whose counts were zeroed count from where the switch is, which is a little beside."""
-        index = np.flatnonzero((self._last_mode == Mode.FAULT) & (mode == Mode.IDLE))
+        index = np.flatnonzero((self._last_mode == int(Mode.FAULT)) & (mode == int(Mode.IDLE)))
         self._last_mode = mode
         if not index.size:
             return
@@ -350,18 +350,20 @@ class _Wind:
     def __init__(self, gusts: Gusts, n_average: int, day: Day) -> None:
         self._gusts, self._n_average = gusts, max(n_average, 1)
         self._known = gusts.known(day.unix_s)
-        self.past: list[tuple[int, float]] = []
+        self.past: list[tuple[int, float, float]] = []
+        """Step and speed of each sample, and the way of the wind from the day's first one up to it [m/s · steps]."""
 
     def at(self, s: int, first_of: int, gust: npt.NDArray[np.float32]) -> float:
         """Return the average up to a step [m/s]; NaN: unknown now."""
-        self.past.append((s, float(self._gusts.speed_mps(gust[:1, s - first_of].astype(np.float64))[0])))
-        self.past = [each for each in self.past if each[0] > s - self._n_average]
+        speed, past = float(self._gusts.speed_mps(np.asarray(gust[0, s - first_of], np.float64))), self.past
+        # each sample stands for the time until the next one
+        way = past[-1][2] + past[-1][1] * (s - past[-1][0]) if past else 0.0
+        past.append((s, speed, way))
+        while past[0][0] <= s - self._n_average:
+            del past[0]
         if not self._known[s]:
             return float("nan")
-        # each sample stands for the time until the next one
-        times = np.array([each[0] for each in self.past] + [s + 1])
-        speeds = np.array([each[1] for each in self.past])
-        total, length = float(speeds @ np.diff(times)), s + 1 - self.past[0][0]
+        total, length = way + speed - past[0][2], s + 1 - past[0][0]
         if not self._gusts.recorded and length < self._n_average:
             # before the day's first step the wind was what it is on the average
             total, length = total + (self._n_average - length) * self._gusts.mean_mps, self._n_average

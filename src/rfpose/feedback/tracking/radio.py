@@ -25,6 +25,8 @@ from rfpose.scenario import Scenario
 
 __all__ = ["RadioByPosture", "RadioErrors"]
 
+_BLOCK = 1000
+"""Mirrors taken at a time, to bound the memory."""
 _SAMPLE = 200
 """Mirrors from which the effect of a reflection is taken over to all."""
 _SAFE_WAVELENGTHS = 1.0 / 12.0
@@ -130,7 +132,12 @@ class RadioByPosture:
 
     def _covariance(self, rot: FloatArray, hidden: npt.NDArray[np.bool_]) -> FloatArray:
         """(mirror, 3, 3) of the rotation; the carrier takes part where the tones find its whole wavelengths."""
-        pivot = self._pivot
+        hidden = np.broadcast_to(hidden, (len(rot), *hidden.shape[1:]))
+        blocks = [slice(i, i + _BLOCK) for i in range(0, len(rot), _BLOCK)]
+        return np.concatenate([self._covariance_of(self._pivot[b], rot[b], hidden[b]) for b in blocks])
+
+    def _covariance_of(self, pivot: FloatArray, rot: FloatArray, hidden: npt.NDArray[np.bool_]) -> FloatArray:
+        """Return the same of some mirrors."""
         sigma = np.where(hidden, np.inf, self._sigma_m(pivot, rot))
         n_tone = self._waves.n_tone
         mirrors = MirrorProblem.expected(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rfpose.jit import kernel_parallel, prange
+from rfpose.jit import kernel_lean
 
 
-@kernel_parallel
+@kernel_lean
 def filter_gusts(state, keep, kick, n_plain, slow, noise, out):
     """Gusts [m/s] (mirror, step) from ``noise`` (mirror, step, process), state (mirror, process + 1) in place.
 
@@ -13,7 +13,7 @@ def filter_gusts(state, keep, kick, n_plain, slow, noise, out):
     and follows them by ``slow`` a step.
     """
     n = keep.shape[0]
-    for h in prange(state.shape[0]):
+    for h in range(state.shape[0]):
         for t in range(noise.shape[1]):
             plain = 0.0
             quick = 0.0

@@ -228,12 +228,21 @@ def turns(largest_rad: float = _TURN_RAD, count: int = _N_TURN) -> FloatArray:
     count
         Points in a cube about it.
     """
-    from scipy.stats import qmc  # takes a second to load, and only this needs it
-
-    cube = 2.0 * qmc.Halton(3, scramble=False).random(count) - 1.0
+    cube = 2.0 * _halton(count) - 1.0
     length = np.linalg.norm(cube, axis=1)
     inside = length <= 1.0
     return np.concatenate([NO_TURN, largest_rad * cube[inside][np.argsort(length[inside])]])
+
+
+def _halton(n: int) -> FloatArray:
+    """Return Halton's first points in the unit cube (point, 3): scipy has them in a module that takes long to load."""
+    out = np.zeros((n, 3))
+    for axis, base in enumerate((2, 3, 5)):
+        rest, worth = np.arange(n), 1.0 / base
+        while rest.any():  # digits of the point's number, mirrored at the point
+            out[:, axis] += rest % base * worth
+            rest, worth = rest // base, worth / base
+    return out
 
 
 def _direct_probability(problem: GroundProblem, start: RigidFits) -> FloatArray:
