@@ -216,3 +216,11 @@ def test_what_is_said_wrongly_of_raw_samples_is_told_in_options(tmp_path: Path, 
     code, _, error = run("process", tmp_path / "a.iq", "-o", tmp_path / "r.h5", *options.split())
     assert code == 3
     assert error.startswith(f"rfpose: {words}")
+
+
+@pytest.mark.parametrize("option", ["--mqtt", "--opcua"])
+def test_an_address_of_the_plant_that_makes_no_sense_is_told_in_options(files: dict[str, Path], option: str) -> None:
+    anonymous = ["--anonymous"] if option == "--opcua" else []
+    code, _, error = run("publish", files["result"], option, "http://broker", *anonymous)
+    assert code == 3
+    assert error.startswith(f"rfpose: `{option}` must be ")

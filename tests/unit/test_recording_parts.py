@@ -424,6 +424,29 @@ def sigmf_file(folder, name, samples, datatype="ci16_le", centre_hz=1e8):
     (folder / f"{name}.sigmf-meta").write_text(json.dumps(meta))
 
 
+@pytest.mark.parametrize("kind", ["sigmf", "digital-rf", "parts"])
+def test_the_directory_in_which_one_stands(tmp_path, monkeypatch, kind):
+    x = counts(100)
+    one = write(tmp_path / "one.h5", [("r0", 1_790_000_000_000 - START, x)], sample_rate=Fraction(1000))
+    folder = tmp_path / "night"
+    if kind == "parts":
+        folder.mkdir()
+        write(folder / "a.h5", [("r0", 1_790_000_000_000 - START, x)], sample_rate=Fraction(1000))
+    else:
+        if kind == "digital-rf":
+            pytest.importorskip("digital_rf")
+        convert(open_recording(one), folder, format=kind)
+    monkeypatch.chdir(folder)
+    two = write(tmp_path / "two.h5", [("r1", 1_790_000_000_000 - START, x)], sample_rate=Fraction(1000))
+    for given, receivers in ((".", ["r0"]), ([".", two], ["r0", "r1"]), (Path("../night"), ["r0"])):
+        with open_recording(given) as r:
+            assert r.format == (kind if len(receivers) == 1 else "parts")
+            assert list(r.receiver_ids) == receivers
+            assert all(np.array_equal(r.read(name, 1_790_000_000_000, 100), x) for name in receivers)
+            assert all(r.names)
+            assert [name for name in describe(r).get("parts", {}) if not name.strip("./")] == []
+
+
 def test_sigmf_recordings_of_other_types_in_one_directory(tmp_path):
     x = counts(100)
     sigmf_file(tmp_path, "r0", x)

@@ -142,3 +142,11 @@ def test_times_that_are_none(text, words):
 def test_a_time_beyond_the_calendar_is_refused():
     with pytest.raises(InvalidInputError, match="beyond the year 9999"):
         stamp_text(2**61, Fraction(1))
+
+
+def test_a_stamp_that_is_late_alone_is_no_gap_but_is_told():
+    n = [k * 20_000 for k in range(10)]
+    wrong = captures(n, [START + k for k in n], jitter_s=[0.3 if k == 4 else 0.0 for k in range(10)])
+    found = place_captures(wrong, RATE)
+    assert found.start_index == [START + k for k in n]
+    assert found.doubts == ["the time stamp of capture 4 lies 300000 samples too late, alone"]

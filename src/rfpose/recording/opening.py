@@ -73,13 +73,13 @@ def open_recording(
     ...     recording.plot()
     """
     if not isinstance(path, str | Path):
-        given = [Path(each) for each in path]
+        given = [_named(each) for each in path]
         if not given:
             raise InvalidInputError("`path` must name at least one recording")
         if len(given) > 1:
             return _open_set(given, scenario=scenario, declared=declared, follow_links=follow_links)
         path = given[0]
-    path = Path(path)
+    path = _named(path)
     _refuse_missing(path)
     if declared is None:
         if path.is_dir() and (path / MANIFEST_FILE).is_file():
@@ -113,6 +113,12 @@ def files_of(path: RecordingSource) -> list[Path]:
     return found
 
 
+def _named(path: str | Path) -> Path:
+    """Return a path that ends in a name, by which results and messages call it; ``.`` has none."""
+    path = Path(path)
+    return path if path.name else path.absolute()
+
+
 def _refuse_missing(path: Path) -> None:
     try:
         exists = path.exists()
@@ -129,11 +135,11 @@ def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | Non
         return RawRecording(path, scenario=scenario, declared=declared)
     if declared is not None or is_wav(path):
         return WavRecording(path, scenario=scenario, declared=declared, follow_links=follow_links)
+    if path.is_dir():
+        return _open_directory(path, scenario, follow_links=follow_links)
     for header in (path.with_name(f"{path.name}.hdr"), path):
         if is_gnuradio_header(header):
             return GnuRadioRecording(header, scenario=scenario, follow_links=follow_links)
-    if path.is_dir():
-        return _open_directory(path, scenario, follow_links=follow_links)
     if path.name.endswith(SIGMF_ENDINGS):
         from rfpose.recording.sigmf_files import SigmfRecording
 

@@ -171,6 +171,8 @@ def _positions(captures: Sequence[Capture], doubts: list[str]) -> list[int]:
                         f"capture {i} begins {round(step)} samples later than the one before it ends: lost, or a slow "
                         "clock; so few time stamps cannot tell"
                     )
+            elif following[0] > limit + room:
+                doubts.append(f"the time stamp of capture {i} lies {round(following[0])} samples too late, alone")
             elif following[0] < -(limit + room):
                 if statistics.median_low(following) < -(limit + room):
                     raise _too_early(i, round(-following[0]))

@@ -271,8 +271,8 @@ def _connected(broker: Broker) -> Iterator[_Line]:
         client.connect(broker.host, broker.port, keepalive=15)
     except ssl.SSLCertVerificationError as error:
         raise PublishError(
-            f"{broker.url}: the broker's certificate is not to be trusted: {error.verify_message}; give `ca` for one "
-            "of its own, or have it renewed"
+            f"{broker.url}: the broker's certificate is not to be trusted: {error.verify_message}; give `ca=FILE` for "
+            "one of its own, or have it renewed"
         ) from error
     except OSError as error:
         raise PublishError(f"{broker.url}: no broker answers there ({error}); check the address") from error
