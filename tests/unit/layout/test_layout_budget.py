@@ -54,6 +54,16 @@ CASES = {
         {},
         100,
     ),
+    "ground known, calibration surveyed": (
+        two_tones,
+        {
+            "simulation": {"ground": {"coefficient": (-0.1, 0.05)}},
+            "calibration_receiver": {"survey_sigma_m": 1e-4},  # more is seen, and what is left is of second order
+            "budget": {"ground": "known", "ground_coefficient_sigma": 1e-4, "ground_height_sigma_m": 1e-4},
+        },
+        {},
+        100,
+    ),
     "faint ground ignored": (
         two_tones,
         {"simulation": {"ground": {"coefficient": (-1e-3, 0.0)}}, "budget": {"multipath_db": None}},
