@@ -359,8 +359,8 @@ def evaluate(
     result
         As `rfpose.process` gives it, or the file of one.
     truth
-        Rows as in ``result.scenario``; or the recording or result that carries one; or a file, see `read_truth`; without
-        it what the result carries.
+        Rows as in ``result.scenario``; or the recording or result that carries one; or a file, see `read_truth`;
+        without it what the result carries.
     follow_links
         As for `rfpose.recording.open_recording`.
 
