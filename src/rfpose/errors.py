@@ -20,6 +20,10 @@ class RecordingError(RfposeError, OSError):
     """A recording or result file cannot be read, written or understood."""
 
 
+class UnlikeError(RecordingError):
+    """What would be read as one recording differs in rate, sample type or tuning; as parts it may be read."""
+
+
 class GeometryError(RfposeError, ValueError):
     """Positions that admit no solution: coincident, collinear or coplanar points."""
 

@@ -211,6 +211,8 @@ def test_surveyed_delays_are_taken_out_of_what_is_processed(site, tmp_path):
     exact.save(tmp_path / "exact.h5")
     before = rf.process(recording, scenario=told, pose="site")
     after = rf.process(recording, scenario=told, pose="site", survey=tmp_path / "exact.h5")
+    as_object = rf.process(recording, scenario=told, pose="site", survey=exact)
+    assert np.array_equal(as_object.poses.normal_enu, after.poses.normal_enu, equal_nan=True)
     assert np.sqrt(np.mean(after.poses.sigma_rad**2)) < np.sqrt(np.mean(before.poses.sigma_rad**2))
     assert rms_mrad(after) < 3.0 * 1e3 * np.sqrt(np.mean(after.poses.sigma_rad**2))
 

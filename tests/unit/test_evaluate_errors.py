@@ -19,6 +19,7 @@ from rfpose.pipeline.evaluate import Statistics, evaluate, ratio_of, read_truth
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import write_result
 from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
+from rfpose.pipeline.simulate import simulate
 from rfpose.pipeline.solve import solve
 from rfpose.scenario import load_scenario
 from rfpose.truth import Truth
@@ -166,6 +167,17 @@ def test_truth_rows_hold_until_the_next(result: Result) -> None:
     assert truth_rows(truth, start[[0, 2]] + 5).tolist() == [0, 2]
     assert truth_rows(truth, start[:1] - 1).tolist() == [-1]
     assert truth_rows(replace(truth, frame_start_index=None), start).tolist() == [0, 0, 0]
+
+
+def test_truth_of_a_recording_or_result_that_is_open(result: Result) -> None:
+    wanted = evaluate(result).as_dict()
+    bare = replace(result, truth=None)
+    recording = simulate(result.scenario)
+    recording.truth = result.truth
+    assert evaluate(bare, result).as_dict() == wanted
+    assert evaluate(bare, recording).as_dict() == wanted
+    with pytest.raises(InvalidInputError, match=r"<Result .* carries no truth"):
+        evaluate(bare, bare)
 
 
 def test_truth_in_another_order_is_put_right(result: Result) -> None:

@@ -464,13 +464,16 @@ def test_sigmf_recordings_of_other_types_in_one_directory(tmp_path):
             assert set(r.receiver_ids) == {"r0", "r1", "r2", "r3"}
 
 
-def test_a_damaged_sigmf_recording_in_a_directory_is_named_and_the_rest_goes_on(tmp_path):
+def test_a_damaged_sigmf_recording_of_a_directory_in_a_set_is_named_and_the_rest_goes_on(tmp_path):
     for name in ("r0", "r1", "r2"):
         sigmf_file(tmp_path, name, counts(100))
     (tmp_path / "r1.sigmf-meta").write_text("{")
     (tmp_path / "r2.sigmf-data").unlink()
+    with pytest.raises(RecordingError, match=r"r1.sigmf-meta: not valid JSON"):  # alone it is refused
+        open_recording(tmp_path)
+    write(tmp_path / "a.h5", [("r3", 0, counts(100))], sample_rate=Fraction(1000))
     with open_recording(tmp_path) as r:
-        assert r.receiver_ids == ("r0",)
+        assert set(r.receiver_ids) == {"r0", "r3"}
         assert [note.split(":")[0] for note in r.notes] == ["left out"] * 2
         assert "r1.sigmf-meta: not valid JSON" in r.notes[0]
         assert "missing: `r2.sigmf-data`" in r.notes[1]

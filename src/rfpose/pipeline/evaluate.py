@@ -21,7 +21,7 @@ from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.result_summary import count_reasons, left_out_of
 from rfpose.pipeline.formats.truth_rows import align_truth, truth_rows
 from rfpose.pipeline.noise import phase_noise
-from rfpose.recording import open_recording
+from rfpose.recording import Recording, open_recording
 from rfpose.scenario import Scenario
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
@@ -343,7 +343,10 @@ def _truth_from_json(path: Path, scenario: Scenario) -> Truth:
 
 
 def evaluate(
-    result: Result | str | Path, truth: Truth | str | Path | None = None, *, follow_links: bool = False
+    result: Result | str | Path,
+    truth: Truth | Recording | Result | str | Path | None = None,
+    *,
+    follow_links: bool = False,
 ) -> Evaluation:
     """Compare a result with the truth and with the bound.
 
@@ -356,7 +359,8 @@ def evaluate(
     result
         As `rfpose.process` gives it, or the file of one.
     truth
-        Rows as in ``result.scenario``, or a file, see `read_truth`; without it what the result carries.
+        Rows as in ``result.scenario``; or the recording or result that carries one; or a file, see `read_truth`;
+        without it what the result carries.
     follow_links
         As for `rfpose.recording.open_recording`.
 
@@ -382,6 +386,11 @@ def evaluate(
     result = result if isinstance(result, Result) else open_result(result)
     if truth is None:
         truth = result.truth
+    elif isinstance(truth, Recording | Result):
+        carried = truth.truth
+        if carried is None:
+            raise InvalidInputError(f"{truth!r} carries no truth; give what was simulated")
+        truth = align_truth(carried, result.scenario)
     elif not isinstance(truth, Truth):
         truth = read_truth(truth, result.scenario, follow_links=follow_links)
     if truth is None:

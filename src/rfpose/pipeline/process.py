@@ -53,7 +53,7 @@ def process(
     reflection: str | None = None,
     integrity: bool | None = None,
     filtered: bool | None = None,
-    survey: str | Path | None = None,
+    survey: SurveyFile | str | Path | None = None,
     follow_links: bool = False,
     force: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
@@ -84,7 +84,7 @@ def process(
     filtered
         Whether poses are filtered over frames besides; None: as the scenario's ``[motion]`` says.
     survey
-        File of `rfpose survey`: where receivers, pivots and transmitters are.
+        As `rfpose.survey` gives it, or the file of one: where receivers, pivots and transmitters are.
     follow_links
         As for `rfpose.recording.open_recording`.
     force
@@ -216,12 +216,12 @@ class Asked:
     reflection: str | None
     integrity: bool | None
     filtered: bool | None
-    survey: str | Path | None
+    survey: SurveyFile | str | Path | None
 
     @property
-    def files(self) -> list[str | Path | None]:
+    def files(self) -> list[str | Path]:
         """What is read besides the recording."""
-        return [None if isinstance(self.scenario, Scenario) else self.scenario, self.survey]
+        return [given for given in (self.scenario, self.survey) if isinstance(given, str | Path)]
 
     def site_of(self, recording: Recording) -> tuple[Scenario, SurveyFile | None]:
         """Return the site, as far as a survey knows it better, and the survey.
@@ -236,7 +236,7 @@ class Asked:
         if self.survey is not None:
             from rfpose.pipeline.formats.survey_file import read_survey
 
-            surveyed = read_survey(self.survey)
+            surveyed = read_survey(self.survey) if isinstance(self.survey, str | Path) else self.survey
             site = surveyed.applied(site)
         check_against(recording, site)
         return site, surveyed
@@ -267,7 +267,7 @@ class Asked:
         if isinstance(self.scenario, str | Path):
             command += f" --scenario {Path(self.scenario).name}"
         if self.survey is not None:
-            command += f" --survey {Path(self.survey).name}"
+            command += f" --survey {Path(self.survey).name if isinstance(self.survey, str | Path) else 'GIVEN'}"
         if self.reflection is not None:
             command += f" --reflection {self.reflection}"
         if self.integrity is not None:

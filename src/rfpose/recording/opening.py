@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TypeAlias
 
-from rfpose.errors import InvalidInputError, RecordingError, ScenarioError
+from rfpose.errors import InvalidInputError, RecordingError, ScenarioError, UnlikeError
 from rfpose.heaps import open_hdf5
 from rfpose.kinds import COMPRESSED_SIGMF, SIGMF_ENDINGS, is_hdf5, kind_of
 from rfpose.recording.base import Recording
@@ -148,10 +148,10 @@ def _open_one(path: Path, scenario: Scenario | None, *, declared: Declared | Non
 
 
 def _open_folder(path: Path, scenario: Scenario | None, *, follow_links: bool) -> Recording:
-    """Open a directory as one recording; of SigMF recordings that are unlike, or damaged, as their parts."""
+    """Open a directory as one recording; of SigMF recordings that are unlike, as their parts."""
     try:
         return _open_one(path, scenario, declared=None, follow_links=follow_links)
-    except RecordingError:
+    except UnlikeError:
         metas = _metas(path)
         if len(metas) > 1:
             with contextlib.suppress(RecordingError):  # if none can be read apart, why not as one is told

@@ -17,7 +17,7 @@ from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 
-from rfpose.errors import InvalidInputError, RecordingError, install_remedy
+from rfpose.errors import InvalidInputError, RecordingError, UnlikeError, install_remedy
 from rfpose.foreign import TEXT_BYTES, exact_number, exact_rate, load_json, parse_json
 from rfpose.kinds import COMPRESSED_SIGMF
 from rfpose.recording.base import IndexArray, SampleFormat
@@ -134,7 +134,7 @@ class SigmfRecording(FlatRecording):
             ):
                 alike = what == "sample type" and _alike(signal.type, first.type)
                 if mine != theirs and not alike:
-                    raise RecordingError(
+                    raise UnlikeError(
                         f"{path}: `{name}` and `{first_name}` differ in {what}: {mine} and {theirs}; put them into "
                         "separate directories"
                     )
