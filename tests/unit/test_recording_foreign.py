@@ -168,8 +168,13 @@ def test_drf_damaged_file(tmp_path, capsys):
     write_drf(tmp_path / "d", "r0", [(0, counts(30_000))])
     middle = sorted((tmp_path / "d" / "r0").rglob("rf@*.h5"))[1]
     middle.write_bytes(middle.read_bytes()[:3000])
-    with open_recording(tmp_path / "d") as r, pytest.raises(RecordingError, match=r"cannot read `r0`: .*truncated"):
-        r.blocks("r0")
+    with open_recording(tmp_path / "d") as r:
+        assert r.blocks("r0").tolist() == [[EPOCH, 10_000], [EPOCH + 20_000, 10_000]]
+        assert np.array_equal(r.read("r0", EPOCH + 20_000, 10_000), counts(30_000)[20_000:])
+        (told,) = [problem for problem in describe(r)["problems"] if "damaged" in problem]
+    assert told.startswith(f"r0: its file `{middle.name}` is damaged (")
+    assert "truncated" in told
+    assert told.endswith("its samples are left out; copy it again")
     assert capsys.readouterr().out == ""
 
 

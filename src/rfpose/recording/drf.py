@@ -205,7 +205,7 @@ class DigitalRfRecording(Recording):
         return np.array([(piece.start, piece.length) for piece in self._pieces[channel]], np.int64).reshape(-1, 2)
 
     def _pieces_in(self, channel: str, path: Path) -> list[_Piece]:
-        """Return the stretches in one file; a file to which nothing was written has none."""
+        """Return the stretches in one file; one that is damaged, or to which nothing was written, has none."""
         try:
             with open_hdf5(path) as file:
                 if file.get("rf_data", getlink=True) is None or file.get("rf_data_index", getlink=True) is None:
@@ -213,8 +213,11 @@ class DigitalRfRecording(Recording):
                     return []
                 n_sample = len(_samples(file, self._channels[channel], self._follow_links))
                 table = _index(file, n_sample, self._follow_links)
-        except _HDF5_ERRORS as error:
+        except (RecordingError, PermissionError) as error:
             raise _unreadable(path, channel, error) from error
+        except _HDF5_ERRORS as error:  # costs what is in it, and nothing of the others
+            self._tell(channel, f"its file `{path.name}` is damaged ({error}): its samples are left out; copy it again")
+            return []
         ends = np.append(table[1:, 1], n_sample)
         return [
             _Piece(start, end - offset, offset, path)
