@@ -15,7 +15,6 @@ from rfpose.antenna import AntennaPattern, PatternTable, dipole_pattern, grid_di
 from rfpose.checks import FloatArray
 from rfpose.errors import InvalidInputError, ScenarioError
 from rfpose.multilat.site import Common, Voltages
-from rfpose.pipeline.formats.antenna_file import read_pattern
 from rfpose.pipeline.mirrors import MirrorGroup
 from rfpose.propagation import Foresight, Rays, ReceiverStand, Soil, Surroundings, foresee
 from rfpose.propagation.site import place_things
@@ -206,6 +205,8 @@ def _version_of(path: str | Path) -> tuple[int, int] | None:
 # studies of a site ask for the same pattern again and again
 @functools.lru_cache(maxsize=4)
 def _pattern(path: str, version: tuple[int, int] | None) -> AntennaPattern:
+    from rfpose.pipeline.formats.antenna_file import read_pattern  # loads HDF5, which layout studies mostly do without
+
     return read_pattern(path).pattern
 
 
