@@ -15,6 +15,7 @@ import argparse
 import asyncio
 import collections
 import contextlib
+import dataclasses
 import multiprocessing
 import os
 import random
@@ -47,7 +48,9 @@ def main() -> None:
         folder.mkdir()
         os.chdir(folder)
         jobs = jobs_in(Path(name))
-        chosen = {title: jobs[title][0] for title in ("process", "track")}
+        # of a method that learns each day is a task, which goes on from the one before
+        days = dataclasses.replace(jobs["track"][0], words=(*jobs["track"][0].words, "--days", "4"))
+        chosen = {"process": jobs["process"][0], "track": days}
         known, lasts = {}, {}
         for title, job in chosen.items():
             known[title] = undisturbed(folder, job).left
