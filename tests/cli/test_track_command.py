@@ -104,6 +104,18 @@ def test_stopped_and_resumed_equals_undisturbed(site, tmp_path):
     assert not parts.exists()
     with pytest.raises(RecordingError, match=r"another job \(different: seed\)"):
         job(parts, seed=6)
+    state = tmp_path / ".parts.h5.state"
+    kept = state.read_bytes()
+    with np.load(state) as stored:
+        arrays = dict(stored)
+    arrays["key.json"] = np.array(
+        str(arrays["key.json"]).replace('"layout of the state": "2"', '"layout of the state": "1"')
+    )
+    with state.open("wb") as file:
+        np.savez(file, **arrays)
+    with pytest.raises(RecordingError, match=r"another job \(different: layout of the state\)"):
+        job(parts, seed=5)
+    state.write_bytes(kept)
     seen = []
     resumed = job(parts, seed=5, on_progress=lambda done, total: seen.append(done))
     assert seen == [3]

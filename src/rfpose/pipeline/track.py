@@ -46,6 +46,8 @@ class TrackChanges:
 
 
 _AS_IT_STANDS = TrackChanges()
+_STATE_LAYOUT = "2"
+"""Told apart from unfinished work that was kept with other arrays, which cannot be gone on from."""
 _KEEPING = 0.02
 """Of the time of others, so much may go into keeping what each result adds: it is a day, which took them long."""
 
@@ -134,7 +136,12 @@ def track(
             "heliostats": str(len(simulation.field)),
         }
         digests = {name: _digest(path) for name, path in records.items() if path is not None}
-        key = settings | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()} | digests
+        key = (
+            settings
+            | {"layout of the state": _STATE_LAYOUT}
+            | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()}
+            | digests
+        )
         checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
         state = None if checkpoint is None else checkpoint.read()
         with naming(scenario):
