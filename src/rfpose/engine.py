@@ -470,11 +470,14 @@ def _local_cluster(n_worker: int) -> Iterator[Any]:
 def _client(where: Any) -> Iterator[Client]:
     """Connect to a scheduler for the block."""
     from distributed import Client
+    from distributed.comm import get_address_host
 
     for name in list(logging.root.manager.loggerDict):
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told by what is raised
     try:
+        if isinstance(where, str):
+            get_address_host(where)  # a client of what is no address at all takes 20 s to be given up
         client = Client(where, timeout=_CONNECT_S, set_as_default=False, name="rfpose")
     except (OSError, ValueError, TypeError) as error:
         raise ClusterError(

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -518,3 +519,12 @@ def test_a_scheduler_that_dies_is_named_and_nothing_is_lost(recording: Path, alo
         script.wait()
     process(recording, result)
     assert result.read_bytes() == alone
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp://host", "carrier-pigeon://host:1"])
+def test_what_is_no_address_leaves_no_client_behind(recording, tmp_path, address):
+    """One that is begun and given up goes on in a thread of its own, and complains at the end of the process."""
+    before = set(threading.enumerate())
+    with Engine(scheduler=address).used(), pytest.raises(ClusterError, match=f"{address}: no Dask scheduler answers"):
+        process(recording, tmp_path / "r.h5")
+    assert {thread.name for thread in set(threading.enumerate()) - before} == set()
