@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -11,10 +12,13 @@ from rfpose.heaps import open_hdf5
 __all__ = [
     "COMPRESSED_SIGMF",
     "FORMAT_KINDS",
+    "JOURNAL_KEY",
+    "LIVE_SCENARIO",
     "SIGMF_ENDINGS",
     "check_kind",
     "head_of",
     "is_hdf5",
+    "is_live",
     "kind_of",
     "told_kind",
 ]
@@ -49,6 +53,10 @@ _MADE = {
 COMPRESSED_SIGMF = (".sigmf.gz", ".sigmf.xz", ".sigmf.zip")
 """Endings of SigMF's archives that are compressed."""
 SIGMF_ENDINGS = (".sigmf", ".sigmf-meta", ".sigmf-data", ".sigmf-collection", *COMPRESSED_SIGMF)
+JOURNAL_KEY = "key.json"
+"""File of a directory of unfinished work: what that depends on."""
+LIVE_SCENARIO = "scenario"
+"""What that names where the work is a result that can be read meanwhile."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HEAD_BYTES = 2**16
 
@@ -74,7 +82,7 @@ def kind_of(path: str | Path) -> str | None:
         return "recording"
     head = head_of(path, _HEAD_BYTES)
     if not head:
-        return None
+        return "result" if is_live(path) else None
     if head[:4] in (b"RIFF", b"RF64", b"BW64") and head[8:12] == b"WAVE":
         return "recording"
     if head.startswith(_HDF5):
@@ -95,6 +103,15 @@ def is_hdf5(path: str | Path) -> bool:
             return file.read(len(_HDF5)) == _HDF5
     except (OSError, ValueError):
         return False
+
+
+def is_live(path: str | Path) -> bool:
+    """Tell whether a directory holds a result that is, or was, being made frame by frame."""
+    try:
+        found = json.loads((Path(path) / JOURNAL_KEY).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and LIVE_SCENARIO in found
 
 
 def _kind_of_hdf5(path: Path) -> str | None:

@@ -159,6 +159,12 @@ def test_an_interrupted_one_goes_on_and_another_recording_is_refused(night: Path
         rf.process(Follow(recorder.to, on_frame=stop), output)
     assert not output.exists()
     assert len(rf.open_result(partial_of(output)).frame_start_index) == 3
+    picture = tmp_path / "map.png"
+    for words in ("info", f"plot -o {picture}"):  # as a finished one
+        command, *options = words.split()
+        done = CliRunner().invoke(app, [command, str(partial_of(output)), *options])
+        assert done.exit_code == 0, done.output
+    assert picture.stat().st_size > 10_000
     # the recorder has removed what it wrote first; what was measured of it stays
     whole = tmp_path / "whole"
     shutil.copytree(recorder.to, whole)

@@ -161,8 +161,9 @@ def command(
 
 def _follower(result: Path, *, only_new: bool) -> ResultFollower:
     """Return who sees the frames of a result as they come."""
+    from rfpose.kinds import is_live
     from rfpose.pipeline.formats.journal import partial_of
-    from rfpose.pipeline.formats.live_result import ResultFollower, is_live
+    from rfpose.pipeline.formats.live_result import ResultFollower
 
     if not result.exists() and not is_live(partial_of(result)):
         click.echo(f"rfpose: note: {result}: not begun yet; waiting for its first frame", err=True)

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from rfpose.errors import RecordingError
 from rfpose.files import make_directory, replace_content
+from rfpose.kinds import JOURNAL_KEY
 
 __all__ = ["Entry", "Journal", "entries_in", "partial_of", "read_entry", "read_key"]
 
 Entry = dict[str, npt.NDArray[Any]]
 
-_KEY_NAME = "key.json"
 _ENTRY_NAME = re.compile(r"rows-(\d{12})-(\d{12})\.npz")
 
 _log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ def partial_of(path: str | Path) -> Path:
 def read_key(directory: Path) -> dict[str, str] | None:
     """Return what the entries of a directory depend on; None: it is no journal."""
     try:
-        found = json.loads((directory / _KEY_NAME).read_text(encoding="utf-8"))
+        found = json.loads((directory / JOURNAL_KEY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
@@ -96,7 +96,7 @@ class Journal:
                 )
             self.remove()
         make_directory(directory)
-        replace_content(directory / _KEY_NAME, json.dumps(dict(key), indent=1, sort_keys=True).encode())
+        replace_content(directory / JOURNAL_KEY, json.dumps(dict(key), indent=1, sort_keys=True).encode())
 
     def _refuse_strangers(self) -> None:
         """Without a key, only what a job leaves that was killed while it wrote the key may be there."""
@@ -107,7 +107,7 @@ class Journal:
 
     @staticmethod
     def _is_own(path: Path) -> bool:
-        return path.name == _KEY_NAME or path.suffix == ".part" or _ENTRY_NAME.fullmatch(path.name) is not None
+        return path.name == JOURNAL_KEY or path.suffix == ".part" or _ENTRY_NAME.fullmatch(path.name) is not None
 
     def read(self) -> list[tuple[int, int, Entry]]:
         """Return ``(first row, end row, arrays)`` of the entries from row zero on; what follows a damaged one is lost.
@@ -150,4 +150,4 @@ class Journal:
 
 
 def _removal_order(path: Path) -> tuple[bool, str]:
-    return path.name == _KEY_NAME, path.name
+    return path.name == JOURNAL_KEY, path.name

@@ -18,14 +18,14 @@ import numpy.typing as npt
 from rfpose.dsp import FrameTones, TonePhases
 from rfpose.errors import RecordingError, RfposeError
 from rfpose.interruption import held_back
+from rfpose.kinds import LIVE_SCENARIO, is_live
 from rfpose.pipeline.formats.journal import Entry, Journal, entries_in, partial_of, read_entry, read_key
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import KEYS, columns_of, open_result, result_of
 from rfpose.scenario import Scenario, parse_scenario
 
-__all__ = ["LiveResult", "ResultFollower", "is_live", "n_frame_in", "open_live", "probe_in"]
+__all__ = ["LiveResult", "ResultFollower", "n_frame_in", "open_live", "probe_in"]
 
-_SCENARIO = "scenario"
 _PROBE = "first frame"
 _SETTING = "setting "
 _DAMAGES = (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile, RfposeError)
@@ -34,11 +34,6 @@ _MERGED = 64
 """Files of one frame that become one."""
 _MERGED_BYTES = 2**23
 """Or fewer, where they are as large together."""
-
-
-def is_live(path: str | Path) -> bool:
-    """Tell whether a directory holds a result that is, or was, being made frame by frame."""
-    return Path(path).is_dir() and _SCENARIO in (read_key(Path(path)) or {})
 
 
 def probe_in(directory: str | Path) -> str | None:
@@ -72,7 +67,7 @@ class LiveResult:
         self, directory: Path, scenario: Scenario, settings: Mapping[str, str], *, probe: str, restart: bool
     ) -> None:
         key = {
-            _SCENARIO: scenario.to_toml(),
+            LIVE_SCENARIO: scenario.to_toml(),
             _PROBE: probe,
             **{f"{_SETTING}{name}": text for name, text in settings.items()},
         }
@@ -155,11 +150,11 @@ def open_live(directory: str | Path, first_frame: int = 0) -> Result:
     """
     directory = Path(directory)
     key = read_key(directory)
-    if key is None or _SCENARIO not in key:
+    if key is None or LIVE_SCENARIO not in key:
         raise RecordingError(
             f"{directory}: no result that is being made frame by frame; give such a directory, or a result"
         )
-    scenario = _scenario_of(key[_SCENARIO], f"{directory}:scenario")
+    scenario = _scenario_of(key[LIVE_SCENARIO], f"{directory}:scenario")
     settings = {name.removeprefix(_SETTING): text for name, text in key.items() if name.startswith(_SETTING)}
     try:
         parts = list(_frames_from(directory, first_frame))

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rfpose.errors import RfposeError
-from rfpose.kinds import kind_of
+from rfpose.kinds import is_live, kind_of
 from rfpose.pipeline.formats.journal import partial_of
-from rfpose.pipeline.formats.live_result import is_live, n_frame_in, open_live
+from rfpose.pipeline.formats.live_result import n_frame_in, open_live
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import is_result, open_result
 from rfpose.pipeline.formats.track_file import is_track, open_track
