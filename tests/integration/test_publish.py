@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import shutil
@@ -54,9 +55,12 @@ def result() -> Result:
 
 
 def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+    """Return one below those that systems give to connections, so that nobody has it while a broker is away."""
+    for port in np.random.default_rng().integers(15_000, 32_000, 100).tolist():
+        with socket.socket() as free, contextlib.suppress(OSError):
+            free.bind(("127.0.0.1", port))
+            return int(port)
+    raise AssertionError("no port is free")
 
 
 def _certificate(folder: Path, name: str, *, days: int = 1) -> tuple[Path, Path]:
@@ -143,8 +147,9 @@ class _Mosquitto:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
-        self._process = subprocess.Popen([str(BROKER), "-c", self._config], stderr=subprocess.DEVNULL)
         for _ in range(100):
+            if self._process is None or self._process.poll() is not None:  # the port was not free yet
+                self._process = subprocess.Popen([str(BROKER), "-c", self._config], stderr=subprocess.DEVNULL)
             with socket.socket() as asked:
                 if not asked.connect_ex(("127.0.0.1", self.port)):
                     return
