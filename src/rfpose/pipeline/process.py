@@ -313,7 +313,8 @@ def _elsewhere(recording: Recording | RecordingSource, *, follow_links: bool) ->
 
     if isinstance(recording, Recording):
         raise InvalidInputError(
-            "`recording` must be paths where others measure: workers open it themselves, by what it says of itself"
+            "`recording` must be paths where others measure: workers open it themselves, by what it says of itself; "
+            "what is to be told of raw samples goes into a manifest (recording.toml), whose path they can be given"
         )
     paths = (recording,) if isinstance(recording, str | Path) else recording
     return OtherProcesses(paths=tuple(map(Path, paths)), follow_links=follow_links)
