@@ -1,14 +1,15 @@
 """Opening HDF5 files whose heaps of texts are sound: of one damage of these the HDF5 library does not come back.
 
 Texts of any length lie in *global heap collections* (HDF5 file format specification 4.0, III.E), blocks without a
-checksum. The library (2.0.0, and those before) goes through such a block object by object, and stands still for ever at
+checksum. The library (2.0.0) goes through such a block object by object, and stands still for ever at
 free space that is said to be of no length; it cannot be interrupted from Python. So they are looked through before.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 if TYPE_CHECKING:
     import h5py
@@ -19,9 +20,9 @@ _COLLECTION: Final = b"GCOL\1\0\0\0"
 _COLLECTION_HEAD: Final = 16  # and its length
 _OBJECT_HEAD: Final = 16  # index, count of references, nothing, length
 _LEAST_BYTES: Final = 4096
-_END_BYTES: Final = 2**18
+_END_BYTES: Final = 2**16
 """Where recordings are long, their texts stand before the samples or after them."""
-_WHOLE_BYTES: Final = 2**20
+_PIECE_BYTES: Final = 2**20
 
 
 def open_hdf5(path: Path, *, tables: bool = False, **options: Any) -> h5py.File:
@@ -49,7 +50,7 @@ def check_heaps(path: Path, *, everywhere: bool) -> None:
     Parameters
     ----------
     everywhere
-        False: of long files a quarter of a MiB at the beginning and at the end is looked at.
+        False: heaps of long files are looked for in 64 KiB at the beginning and at the end.
 
     Raises
     ------
@@ -58,29 +59,34 @@ def check_heaps(path: Path, *, everywhere: bool) -> None:
     """
     with path.open("rb") as file:
         length = file.seek(0, 2)
-        if everywhere or length <= _WHOLE_BYTES:
-            pieces = [(0, length)]
-        else:
-            pieces = [(0, _END_BYTES), (length - _END_BYTES, length)]
-        for begin, end in pieces:
+        for begin, end in _pieces(length, everywhere=everywhere):
             file.seek(begin)
-            _check_piece(file.read(end - begin), begin)
+            stored = file.read(end - begin)
+            at = stored.find(_COLLECTION)
+            while at >= 0:
+                _check_collection(file, begin + at, length)
+                at = stored.find(_COLLECTION, at + 1)
 
 
-def _check_piece(stored: bytes, offset: int) -> None:
-    at = stored.find(_COLLECTION)
-    while at >= 0:
-        stop = at + int.from_bytes(stored[at + 8 : at + _COLLECTION_HEAD], "little")
-        if at + _LEAST_BYTES <= stop <= len(stored):  # else the library refuses it, or it is not whole here
-            _check_collection(stored, at, stop, offset)
-        at = stored.find(_COLLECTION, at + 1)
+def _pieces(length: int, *, everywhere: bool) -> Iterator[tuple[int, int]]:
+    """Yield where to look; pieces overlap, so that none cuts the beginning of a heap."""
+    if not everywhere and length > 2 * _END_BYTES:
+        yield from ((0, _END_BYTES), (length - _END_BYTES, length))
+        return
+    for begin in range(0, length, _PIECE_BYTES):
+        yield begin, min(begin + _PIECE_BYTES + len(_COLLECTION) - 1, length)
 
 
-def _check_collection(stored: bytes, begin: int, end: int, offset: int) -> None:
-    at = begin + _COLLECTION_HEAD
+def _check_collection(file: BinaryIO, begin: int, length: int) -> None:
+    file.seek(begin + len(_COLLECTION))
+    end = int.from_bytes(file.read(_COLLECTION_HEAD - len(_COLLECTION)), "little")
+    if not _LEAST_BYTES <= end <= length - begin:  # the library refuses it
+        return
+    file.seek(begin)
+    stored, at = file.read(end), _COLLECTION_HEAD
     while at + _OBJECT_HEAD <= end:
         index = int.from_bytes(stored[at : at + 2], "little")
-        length = int.from_bytes(stored[at + 8 : at + _OBJECT_HEAD], "little")
-        if index == 0 and length < _OBJECT_HEAD:  # the length of free space is said with its head
-            raise OSError(f"the heap of texts at byte {offset + begin} is damaged at byte {offset + at}")
-        at += length if index == 0 else _OBJECT_HEAD + (length + 7) // 8 * 8
+        size = int.from_bytes(stored[at + 8 : at + _OBJECT_HEAD], "little")
+        if index == 0 and size < _OBJECT_HEAD:  # the size of free space is said with its head
+            raise OSError(f"the heap of texts at byte {begin} is damaged at byte {begin + at}")
+        at += size if index == 0 else _OBJECT_HEAD + (size + 7) // 8 * 8

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 import subprocess
 import sys
 import zipfile
@@ -82,3 +83,22 @@ def test_free_space_of_no_length_in_a_heap_of_texts_is_refused(tmp_path, kind):
     assert "copy it again" in done.stderr
     with pytest.raises(OSError, match=f"heap of texts at byte {heap} is damaged at byte {at}"):
         check_heaps(path, everywhere=True)
+
+
+@pytest.mark.parametrize(
+    ("at", "everywhere", "seen"),
+    [(100, False, True), (2**20 - 3, True, True), (2**20 - 3, False, False), (2**22 - 20_000, False, True)],
+)
+@pytest.mark.parametrize("free", [0, 7, 2**17 - 16 - 24])
+def test_heaps_are_found_where_they_may_lie(tmp_path, at, everywhere, seen, free):
+    """One of 128 KiB: an object of five bytes, and free space to the end."""
+    length = 2**17 if at == 100 else 4096 + 8192
+    free = min(free, length - 16 - 24)
+    heap = b"GCOL\1\0\0\0" + struct.pack("<QHHIQ5s3xHHIQ", length, 1, 1, 0, 5, b"texts", 0, 0, 0, free)
+    path = tmp_path / "a.h5"
+    path.write_bytes(bytes(at) + heap.ljust(length, b"\0") + bytes(2**22 - at - length))
+    if free >= 16 or not seen:
+        check_heaps(path, everywhere=everywhere)
+    else:
+        with pytest.raises(OSError, match=f"texts at byte {at} is damaged at byte {at + 40}"):
+            check_heaps(path, everywhere=everywhere)
