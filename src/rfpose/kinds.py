@@ -20,6 +20,7 @@ __all__ = [
     "is_hdf5",
     "is_live",
     "kind_of",
+    "read_key",
     "told_kind",
 ]
 
@@ -107,11 +108,16 @@ def is_hdf5(path: str | Path) -> bool:
 
 def is_live(path: str | Path) -> bool:
     """Tell whether a directory holds a result that is, or was, being made frame by frame."""
+    return LIVE_SCENARIO in (read_key(path) or {})
+
+
+def read_key(directory: str | Path) -> dict[str, str] | None:
+    """Return what the unfinished work in a directory depends on; None: there is none."""
     try:
-        found = json.loads((Path(path) / JOURNAL_KEY).read_text(encoding="utf-8"))
+        found = json.loads((Path(directory) / JOURNAL_KEY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(found, dict) and LIVE_SCENARIO in found
+        return None
+    return found if isinstance(found, dict) else None
 
 
 def _kind_of_hdf5(path: Path) -> str | None:

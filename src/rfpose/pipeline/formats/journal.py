@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from rfpose.errors import RecordingError
 from rfpose.files import make_directory, replace_content
-from rfpose.kinds import JOURNAL_KEY
+from rfpose.kinds import JOURNAL_KEY, read_key
 
-__all__ = ["Entry", "Journal", "entries_in", "partial_of", "read_entry", "read_key"]
+__all__ = ["Entry", "Journal", "entries_in", "partial_of", "read_entry"]
 
 Entry = dict[str, npt.NDArray[Any]]
 
@@ -32,15 +32,6 @@ def partial_of(path: str | Path) -> Path:
     """Return where a result is kept while it is made."""
     path = Path(path)
     return path.with_name(f"{path.name}.partial")
-
-
-def read_key(directory: Path) -> dict[str, str] | None:
-    """Return what the entries of a directory depend on; None: it is no journal."""
-    try:
-        found = json.loads((directory / JOURNAL_KEY).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
 
 
 def entries_in(directory: Path) -> list[tuple[int, int, Path]]:

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from rfpose.dsp import FrameTones, TonePhases
 from rfpose.errors import RecordingError, RfposeError
 from rfpose.interruption import held_back
-from rfpose.kinds import LIVE_SCENARIO, is_live
-from rfpose.pipeline.formats.journal import Entry, Journal, entries_in, partial_of, read_entry, read_key
+from rfpose.kinds import LIVE_SCENARIO, is_live, read_key
+from rfpose.pipeline.formats.journal import Entry, Journal, entries_in, partial_of, read_entry
 from rfpose.pipeline.formats.result import Result
 from rfpose.pipeline.formats.result_file import KEYS, columns_of, open_result, result_of
 from rfpose.scenario import Scenario, parse_scenario
