@@ -43,6 +43,8 @@ _REMEMBERED_FILES: Final = 8
 """Of a channel that grows: files of one time, which are listed again with new ones."""
 # H5Tget_class, bytes a component
 _SAMPLE_FORMATS: dict[tuple[int, int], SampleFormat] = {(0, 2): "int16", (1, 4): "complex64"}
+_NOT_TO_BE_HAD: Final = (RecordingError, FileNotFoundError, PermissionError, BlockingIOError)
+"""What is no damage of the file."""
 _HDF5_ERRORS: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError)
 """What h5py raises at what it cannot read or has no type for."""
 
@@ -213,7 +215,7 @@ class DigitalRfRecording(Recording):
                     return []
                 n_sample = len(_samples(file, self._channels[channel], self._follow_links))
                 table = _index(file, n_sample, self._follow_links)
-        except (RecordingError, PermissionError) as error:
+        except _NOT_TO_BE_HAD as error:
             raise _unreadable(path, channel, error) from error
         except _HDF5_ERRORS as error:  # costs what is in it, and nothing of the others
             self._tell(channel, f"its file `{path.name}` is damaged ({error}): its samples are left out; copy it again")
