@@ -342,27 +342,31 @@ def test_a_bad_transmitter_is_left_out_where_the_ground_reflects():
     assert np.all(np.isfinite(guard.protection_level_rad))
 
 
+def bound_of(field, reflector, calibration, **expected):
+    """Covariance of a field's mirrors where the coefficient is −0.3+0.1j."""
+    return ground_bound(
+        MirrorProblem.expected(TRANSMITTER, PLACES, field.pivot_true, field.rot_true, **expected),
+        carrier_rf_hz=field.carrier_rf_hz,
+        tone_hz=TONE_HZ,
+        reflectors=[reflector],
+        coefficient=[-0.3 + 0.1j],
+        calibration_enu_m=calibration,
+    )
+
+
 @pytest.mark.parametrize("calibration", [None, np.array([[15.0, -20.0, 2.5], [-40.0, 30.0, 3.0]])])
 def test_the_bound_with_estimated_coefficients_is_the_solutions_covariance(calibration):
     field = make_field(32, 20, 100e6, -0.3 + 0.1j, calibration=calibration)
     solution = field.solve(**({} if calibration is None else {"calibration_enu_m": calibration}))
     assert np.all(solution.status == PoseStatus.OK)
-    cov = ground_bound(
-        MirrorProblem.expected(
-            TRANSMITTER,
-            PLACES,
-            field.pivot_true,
-            field.rot_true,
-            sigma_m=np.stack([o.sigma_m for o in field.observations], axis=1),
-            transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in field.observations], axis=1),
-            clock_class=[o.clock_class for o in field.observations],
-            knowledge=field.knowledge,
-        ),
-        carrier_rf_hz=field.carrier_rf_hz,
-        tone_hz=TONE_HZ,
-        reflectors=[Reflector()],
-        coefficient=[-0.3 + 0.1j],
-        calibration_enu_m=calibration,
+    cov = bound_of(
+        field,
+        Reflector(),
+        calibration,
+        sigma_m=np.stack([o.sigma_m for o in field.observations], axis=1),
+        transmitter_sigma_m=np.stack([o.transmitter_sigma_m for o in field.observations], axis=1),
+        clock_class=[o.clock_class for o in field.observations],
+        knowledge=field.knowledge,
     )
     stated = tilt_sigma_rad(solution.full_cov[:, :6, :6], field.rot_true[:, :, 2])
     np.testing.assert_allclose(stated, tilt_sigma_rad(cov[:, :6, :6], field.rot_true[:, :, 2]), rtol=0.02)
@@ -374,22 +378,14 @@ def test_calibration_receivers_that_stand_elsewhere_count_as_places():
     calibration, survey_m = np.array([[15.0, -20.0, 2.5], [-40.0, 30.0, 3.0]]), np.array([0.0, 0.004])
     sigma_m, common_m, n_tone, n_range = 3e-3, 2e-3, len(TONE_HZ), 30
     reflector = Reflector(coefficient=-0.3 + 0.1j)
-    cov = ground_bound(
-        MirrorProblem.expected(
-            TRANSMITTER,
-            PLACES,
-            field.pivot_true,
-            field.rot_true,
-            sigma_m=np.full((3, n_tone, 3, 10), sigma_m),
-            transmitter_sigma_m=np.full((3, n_tone, 10), common_m),
-            clock_class=[0, 1],
-            knowledge=replace(field.knowledge, clock_sigma_m=np.inf),
-        ),
-        carrier_rf_hz=field.carrier_rf_hz,
-        tone_hz=TONE_HZ,
-        reflectors=[reflector],
-        coefficient=[-0.3 + 0.1j],
-        calibration_enu_m=CalibrationSight(place_enu_m=calibration, survey_sigma_m=survey_m),
+    cov = bound_of(
+        field,
+        reflector,
+        CalibrationSight(place_enu_m=calibration, survey_sigma_m=survey_m),
+        sigma_m=np.full((3, n_tone, 3, 10), sigma_m),
+        transmitter_sigma_m=np.full((3, n_tone, 10), common_m),
+        clock_class=[0, 1],
+        knowledge=replace(field.knowledge, clock_sigma_m=np.inf),
     )
 
     def seen(points):

@@ -106,10 +106,8 @@ def command(
     """
     if (mqtt is None) == (opcua is None):
         raise click.UsageError("give one of --mqtt and --opcua")
-    session.options = {
-        **session.options,
-        "url": session.options["opcua" if mqtt is None else "mqtt"],
-    }  # as the library calls either
+    # what the library calls by one name
+    session.options = dict(session.options, url=session.options["opcua" if mqtt is None else "mqtt"])
     if only_new and not follow:
         raise click.UsageError("--new goes with --follow")
     check_there(None if follow else result, password_file, keys.ca, keys.certificate, keys.key)

@@ -136,12 +136,8 @@ def track(
             "heliostats": str(len(simulation.field)),
         }
         digests = {name: _digest(path) for name, path in records.items() if path is not None}
-        key = (
-            settings
-            | {"layout of the state": _STATE_LAYOUT}
-            | {"scenario": hashlib.sha256(site.to_toml().encode()).hexdigest()}
-            | digests
-        )
+        scenario_digest = hashlib.sha256(site.to_toml().encode()).hexdigest()
+        key = settings | digests | {"layout of the state": _STATE_LAYOUT, "scenario": scenario_digest}
         checkpoint = None if place is None else Checkpoint(place, key, restart=force, interval_s=checkpoint_s)
         state = None if checkpoint is None else checkpoint.read()
         with naming(scenario):
