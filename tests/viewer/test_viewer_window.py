@@ -231,7 +231,9 @@ def test_click_on_a_carrier_lights_its_transmitter_up(
 def test_frames_receivers_and_calibration_are_shown(window: MainWindow, files: dict[str, Path], wait: Wait) -> None:
     window.open_path(files["recording"])
     view = recording_of(window)
-    wait(window, lambda: view.track is not None and view.receiver_table.rowCount() == 7)
+    # each is loaded by itself
+    wait(window, lambda: all(found is not None for found in (view.track, view.waterfall, view.look)))
+    wait(window, lambda: view.receiver_table.rowCount() == 7)
     assert view.waterfall.power_db.shape[1] >= 64
     assert np.isfinite(view.waterfall.power_db).all()
     assert view.line_table.item(3, 4).text() == "carrier not found above the noise"  # T4 is blocked at H01
