@@ -226,7 +226,7 @@ def _cache_class() -> Any:
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             rtsys.initialize(target_context)
-            with self._guard_against_spurious_io_errors():
+            with self._guard_against_spurious_io_errors(), _bitcode_left_for_later(target_context.codegen()):
                 try:
                     return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
                 except (AttributeError, ImportError, pickle.UnpicklingError, EOFError):
@@ -240,6 +240,53 @@ def _cache_class() -> Any:
                 _teller.hear_unkept(error)
 
     return KernelCache
+
+
+@contextlib.contextmanager
+def _bitcode_left_for_later(codegen: Any) -> Iterator[None]:
+    """While it lasts, compiled code is loaded without the bitcode by which it is compiled into other kernels.
+
+    Few processes compile any, and reading it takes half of a kernel's loading.
+    """
+    before, codegen._library_class = codegen._library_class, _library_class()
+    try:
+        yield
+    finally:
+        codegen._library_class = before
+
+
+@functools.cache
+def _library_class() -> Any:
+    """Return numba's compiled code whose bitcode is read when a kernel asks for it that is being compiled."""
+    import llvmlite.binding as llvm
+    from numba.core.codegen import JITCodeLibrary
+
+    nothing = llvm.parse_assembly("").as_bitcode()
+
+    class KernelLibrary(JITCodeLibrary):
+        _bitcode: bytes | None = None
+
+        @classmethod
+        def _unserialize(cls, codegen: Any, state: Any) -> Any:
+            name, kind, data = state
+            if kind != "object":
+                return super()._unserialize(codegen, state)  # type: ignore[no-untyped-call]
+            machine_code, bitcode = data
+            library = super()._unserialize(codegen, (name, kind, (machine_code, nothing)))  # type: ignore[no-untyped-call]
+            library._shared_module, library._bitcode = None, bitcode
+            return library
+
+        def _get_module_for_linking(self) -> Any:
+            if self._shared_module is None and self._bitcode is not None:
+                self._shared_module = llvm.parse_bitcode(self._bitcode)
+            return super()._get_module_for_linking()  # type: ignore[no-untyped-call]
+
+        def get_pointer_to_function(self, name: str) -> Any:
+            if self._bitcode is not None:  # numba knows no names of it, and asks for the kernel alone
+                return self._codegen._engine.get_function_address(name)
+            return super().get_pointer_to_function(name)  # type: ignore[no-untyped-call]
+
+    return KernelLibrary
 
 
 def _stamps(name: str) -> tuple[tuple[str, int, int], ...]:

@@ -77,6 +77,18 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_changes(tmp_path):
         assert done.stdout.strip() == wanted, done.stderr
 
 
+def test_a_kernel_is_compiled_into_another_though_it_came_out_of_the_cache(tmp_path):
+    (tmp_path / "inner_kernels.py").write_text(CALLED.format(kind="More", factor=2.0))
+    (tmp_path / "outer_kernels.py").write_text(CALLER)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    alone = "import inner_kernels; print(inner_kernels.doubled(3.0))"
+    called = CALL.format(kind="More")
+    for call, wanted in ((alone, "6.0"), (f"{alone}; {called}", "6.0\n7.0"), (called, "7.0")):
+        command = [sys.executable, "-c", call]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.stdout.strip() == wanted, done.stderr
+
+
 def test_a_full_disk_costs_what_would_be_kept_and_not_the_work(tmp_path):
     (tmp_path / "inner_kernels.py").write_text(CALLED.format(kind="Shape", factor=2))
     run = (
