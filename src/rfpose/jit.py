@@ -41,7 +41,8 @@ Function = Callable[..., Any]
 
 # Reordering and contraction let sums vectorise. "nnan" and "ninf" stay off: NaN is a mark here.
 _REORDER = {"reassoc", "contract", "arcp", "nsz"}
-_COMMON: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+# Nothing calls kernels from C.
+_COMMON: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 _log = logging.getLogger(__name__)
 

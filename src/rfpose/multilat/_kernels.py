@@ -423,7 +423,8 @@ def dop_group(
     _invert(planar, ws)
     for lane in range(LANES):
         ws[DOP2 + lane] = ws[QXX + lane] + ws[QYY + lane] + height * ws[QZZ + lane]
-    ws[QXX : BAD + LANES] = keep
+    for a in range(keep.shape[0]):  # an assignment of slices compiles to much more
+        ws[QXX + a] = keep[a]
 
 
 @kernel

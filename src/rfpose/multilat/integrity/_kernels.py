@@ -223,8 +223,7 @@ def _judge_one(scene, mirrors, m, floor, pivot, rot, clock, data_info, data_grad
                 s = 1.0 if p == q else 0.0
                 for a in range(n):
                     s -= half[p, a] * half[q, a]
-                redundancy[p, q] = s
-        scratch[:] = redundancy
+                redundancy[p, q] = scratch[p, q] = s
         stat[i], rank, hidden[i] = explain(scratch, left[i], tilt, floor, blind, shift[i], spread[i])
         # rows not observed, and those a free transmitter error takes, count in the rank but hold nothing
         dof[i] -= k - rank
