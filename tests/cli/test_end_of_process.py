@@ -66,3 +66,19 @@ def test_what_cannot_be_printed_is_still_an_error():
     with open("/dev/full", "w") as full:  # what is buffered reaches it when the process ends
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, env=buffered, check=False)
     assert done.returncode == 120
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /dev/full")
+@pytest.mark.parametrize("options", [[], ["--json"], ["--json", "--debug"]])
+def test_a_full_disk_behind_standard_output_is_one_line_and_no_traceback(tmp_path, options):
+    site = tmp_path / "site.toml"
+    main = "import rfpose.cli; rfpose.cli.run()"
+    subprocess.run([sys.executable, "-c", main, "init", site], check=True, capture_output=True)
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", main, "info", site, *options], stdout=full, stderr=subprocess.PIPE, check=False
+        )
+    lines = done.stderr.decode().splitlines()
+    assert lines[-1] == "rfpose: No space left on device"
+    assert len(lines) == 1 or "--debug" in options
+    assert done.returncode == 3

@@ -117,13 +117,18 @@ def _leave(ctx: click.Context, message: str) -> NoReturn:
 
 
 def _fail(ctx: click.Context, session: CommonOptions, message: str, code: int) -> NoReturn:
-    """Print one line (and the traceback if asked for), give the JSON reader its object, and leave."""
-    if session.debug:
-        click.echo(traceback.format_exc(), err=True)
+    """Print one line (and the traceback if asked for), give the JSON reader its object, and leave.
+
+    What takes no more text, such as a full disk, may be why the command failed: the other streams still get theirs.
+    """
     line = " ".join(message.split())
-    click.echo(f"rfpose: {line}", err=True)
-    if session.json:
-        emit_json({"error": line, "exit_code": code})
+    with contextlib.suppress(OSError):
+        if session.debug:
+            click.echo(traceback.format_exc(), err=True)
+        click.echo(f"rfpose: {line}", err=True)
+    with contextlib.suppress(OSError):
+        if session.json:
+            emit_json({"error": line, "exit_code": code})
     ctx.exit(code)
 
 
