@@ -104,10 +104,9 @@ class Loop(NamedTuple):
     v_y: float
     v_v: float
     """Transition of the structure's swing over a servo step."""
-    root_y: float
-    root_vy: float
-    root_v: float
-    """Its noise, lower triangle."""
+    kick_y: float
+    kick_v: float
+    """What a random number adds to it."""
     swing_right: float
     swing_up: float
     """Its standard deviation [rad]."""
@@ -191,7 +190,7 @@ class Weather(NamedTuple):
     gust: npt.NDArray[np.float32]
     """(mirror, step) [m/s]."""
     swing: npt.NDArray[np.float32]
-    """(mirror, step, 4) of variance one."""
+    """(mirror, step, 2) right, up, of variance one."""
 
 
 class Readings(NamedTuple):
@@ -485,9 +484,9 @@ def _swing(loop, noise, rate_right, rate_up, state):
         # the mirror stays behind what holds it
         v = state[SWING + 2 * a + 1] - (rate - state[RATE + a]) / loop.servo_s
         scale = loop.swing_right if a == 0 else loop.swing_up
-        w0, w1 = noise[2 * a], noise[2 * a + 1]
-        state[SWING + 2 * a] = loop.y_y * y + loop.y_v * v + scale * loop.root_y * w0
-        state[SWING + 2 * a + 1] = loop.v_y * y + loop.v_v * v + scale * (loop.root_vy * w0 + loop.root_v * w1)
+        push = scale * noise[a]
+        state[SWING + 2 * a] = loop.y_y * y + loop.y_v * v + loop.kick_y * push
+        state[SWING + 2 * a + 1] = loop.v_y * y + loop.v_v * v + loop.kick_v * push
         state[RATE + a] = rate
 
 
