@@ -26,6 +26,7 @@ _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
 _STEEP = 1.2  # an elevation that is safely on this side of the zenith [rad]
 _LAST = 1e-9  # so far off [rad], a step of Newton's method with slopes from nearby is the last: it leaves some 1e-13
+_NEAR = 2e-5  # so far off [rad], one step of second order with slopes from right there leaves as little
 _LITTLE = 1e-3  # an angle whose series ends beneath rounding after the terms taken [rad]
 
 
@@ -309,6 +310,19 @@ def _turned(s, c, angle, by):
 
 
 @kernel_lean
+def _second(z, r, a, b, by_azimuth, by_elevation):
+    """What turns about axes ``z`` and ``r`` change a normal by to second order; to first order by ``a`` and ``b``."""
+    xx, yy, xy = 0.5 * by_azimuth * by_azimuth, 0.5 * by_elevation * by_elevation, by_azimuth * by_elevation
+    # axis 2 goes round with axis 1
+    c0, c1, c2 = xx * a[0] + xy * b[0], xx * a[1] + xy * b[1], xx * a[2] + xy * b[2]
+    return (
+        c1 * z[2] - c2 * z[1] + yy * (b[1] * r[2] - b[2] * r[1]),
+        c2 * z[0] - c0 * z[2] + yy * (b[2] * r[0] - b[0] * r[2]),
+        c0 * z[1] - c1 * z[0] + yy * (b[0] * r[1] - b[1] * r[0]),
+    )
+
+
+@kernel_lean
 def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, wanted):
     """Newton's method from axis angles; those that it ends with go to ``found``, NaN if it does not."""
     found[0] = found[1] = np.nan
@@ -317,6 +331,7 @@ def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, want
     moves = m[M.source_is_point] != 0.0 or m[M.target_is_point] != 0.0
     sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
     a0 = a1 = a2 = b0 = b1 = b2 = 0.0
+    near = False
     for _ in range(30):
         _pose(sa, ca, se, ce, p, prepared, 0.0, state)
         if moves or first:
@@ -338,23 +353,37 @@ def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, want
             r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
             a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
             b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
+            turn_1, turn_2 = (a0, a1, a2), (b0, b1, b2)
+            v0 = v1 = v2 = w0 = w1 = w2 = 0.0
             if moves:
                 # the centre goes with it, and with the centre the normal that is wanted
                 c0, c1, c2 = state[3] - prepared[PIVOT], state[4] - prepared[PIVOT + 1], state[5] - prepared[PIVOT + 2]
-                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
-                a0, a1, a2 = a0 - d0, a1 - d1, a2 - d2
+                v0, v1, v2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
+                a0, a1, a2 = a0 - v0, a1 - v1, a2 - v2
                 x, y = sa * p[P.axis_offset_m], ca * p[P.axis_offset_m]
                 c0 -= prepared[0] * x + prepared[1] * y
                 c1 -= prepared[3] * x + prepared[4] * y
                 c2 -= prepared[6] * x + prepared[7] * y
-                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
-                b0, b1, b2 = b0 - d0, b1 - d1, b2 - d2
+                w0, w1, w2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
+                b0, b1, b2 = b0 - w0, b1 - w1, b2 - w2
+            # slopes are exact but for sag, and where light grazes the mirror, so that it is not known what it sweeps
+            swept = abs(v0) + abs(v1) + abs(v2) + abs(w0) + abs(w1) + abs(w2) > 0.0
+            near = first and square < _NEAR * _NEAR and p[P.gravity_sag_rad] == 0.0 and (swept or not moves)
         aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
         ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
         determinant = aa * bb - ab * ab
         if determinant < 1e-14:
             return 1
         by_azimuth, by_elevation = (bb * ae - ab * be) / determinant, (aa * be - ab * ae) / determinant
+        if near and not done:
+            done = True
+            e0, e1, e2 = _second((z0, z1, z2), (r0, r1, r2), turn_1, turn_2, by_azimuth, by_elevation)
+            ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
+            by_azimuth -= (bb * ae - ab * be) / determinant
+            by_elevation -= (aa * be - ab * ae) / determinant
+            wanted[0] += v0 * by_azimuth + w0 * by_elevation
+            wanted[1] += v1 * by_azimuth + w1 * by_elevation
+            wanted[2] += v2 * by_azimuth + w2 * by_elevation
         azimuth += by_azimuth
         elevation += by_elevation
         if done:

@@ -192,7 +192,7 @@ def empty_tally(n: int, n_outage: int) -> _kernels.Tally:
         by_mode=np.zeros((n, len(Mode), 3)),
         by_outage=np.zeros((n, max(n_outage, 1), 4)),
         hours=np.zeros((n, 24, 2)),
-        histogram=np.zeros((n, _kernels.N_BIN), np.int64),
+        histogram=np.zeros((n, _kernels.N_BIN), np.int32),
     )
 
 
