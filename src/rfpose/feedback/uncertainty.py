@@ -61,7 +61,11 @@ class FitBatch:
         out: FloatArray = _kernels.jacobian_batch(
             p[s], self.k[s], self.count[s], self.row[s], self.use[s], self.index, self.scale
         )
-        return np.nan_to_num(np.where(self.use[s][..., None, None], out, 0.0), posinf=0.0, neginf=0.0)
+        # zero where nothing takes part; beyond an actuator's reach there is no number
+        finite = np.isfinite(out)
+        if not finite.all():
+            out[~finite] = 0.0
+        return out
 
     def scatter(self, p: FloatArray) -> FloatArray:
         """Sigma of the residuals by their median, in stated sigmas (heliostat,); zero without measurements."""

@@ -205,7 +205,9 @@ class Readings(NamedTuple):
     lost: npt.NDArray[np.uint8]
     """(mirror, frame)"""
     outage: npt.NDArray[np.uint8]
-    """(mirror, step) 0, or which one is on, from 1."""
+    """(pattern, step) 0, or which one is on, from 1,"""
+    pattern: npt.NDArray[np.int64]
+    """(mirror,) and whose of these patterns is whose."""
     drift: FloatArray
     """(mirror,) of the receivers' plane or the sensor by day, times the heat [rad]."""
     null: FloatArray
@@ -521,7 +523,8 @@ def _track(h, first, end, tasks, stretch, room):
     )  # fmt: skip
     gust, swing = stretch.surroundings.gust[h], stretch.surroundings.swing[h]
     noise, spread, bias = stretch.readings.noise[h], stretch.readings.spread[h], stretch.readings.bias[h]
-    lost, outage, drift = stretch.readings.lost[h], stretch.readings.outage[h], stretch.readings.drift[h]
+    lost, drift = stretch.readings.lost[h], stretch.readings.drift[h]
+    outage = stretch.readings.outage[stretch.readings.pattern[h]]
     null = stretch.readings.null[h]
     state, ring, light = stretch.memory.state[h], stretch.memory.ring[h], stretch.memory.light[h]
     total, by_mode, by_outage = stretch.tally.total[h], stretch.tally.by_mode[h], stretch.tally.by_outage[h]

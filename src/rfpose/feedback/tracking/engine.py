@@ -41,6 +41,7 @@ class StretchDraws:
     noise: npt.NDArray[np.float32]
     lost: npt.NDArray[np.uint8]
     outage: npt.NDArray[np.uint8]
+    pattern: npt.NDArray[np.int64]
     spread: FloatArray
     bias: FloatArray
 
@@ -131,6 +132,7 @@ class MethodEngine:
                 bias=draws.bias,
                 lost=draws.lost,
                 outage=draws.outage,
+                pattern=draws.pattern,
                 drift=self._drift_rad,
                 null=field.sensor_bias_rad,
             ),
