@@ -9,12 +9,10 @@ next job on the same name.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import json
 import os
-import shutil
-import socket
+import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
@@ -257,6 +255,8 @@ class Claim:
         return output
 
     def _note(self) -> dict[str, Any]:
+        import socket  # here and below: what only jobs that write need would keep help and refusals waiting
+
         return {
             "process": os.getpid(),
             "host": socket.gethostname(),
@@ -378,6 +378,8 @@ def make_directory(path: str | Path) -> Path:
 def remove(path: Path) -> None:
     """Delete a file or a tree, if it is there."""
     if path.is_dir() and not path.is_symlink():
+        import shutil
+
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
@@ -482,7 +484,7 @@ def _take_name(output: _Output) -> None:
     """Give the part its name."""
     if output.real.is_file():
         with contextlib.suppress(OSError):
-            shutil.copymode(output.real, output.part)
+            output.part.chmod(stat.S_IMODE(output.real.stat().st_mode))
     if not output.real.is_dir() or not any(output.real.iterdir()):
         output.part.replace(output.real)
     elif not _exchange(output.part, output.real):
@@ -498,6 +500,8 @@ def _exchange(one: Path, other: Path) -> bool:
     """Exchange two names in one step, so that neither is ever without content; False where the system cannot."""
     if not sys.platform.startswith("linux"):
         return False
+    import ctypes
+
     try:
         rename = ctypes.CDLL(None, use_errno=True).renameat2
     except (OSError, AttributeError):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
 __all__ = ["Shown", "counted", "html_table", "listed", "number", "plain"]
@@ -35,14 +34,12 @@ class Shown(ABC):
 
 def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table for a notebook; of many rows the first."""
+    from html import escape
+
     shown = [*rows[:_MOST_ROWS], *([["…"] * len(header)] if len(rows) > _MOST_ROWS else [])]
-    body = "".join(f"<tr>{_cells(row)}</tr>" for row in shown)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in shown)
     head = "".join(f"<th>{escape(name)}</th>" for name in header)
     return f"<table><caption>{escape(title)}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _cells(row: Sequence[str]) -> str:
-    return "".join(f"<td>{escape(cell)}</td>" for cell in row)
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

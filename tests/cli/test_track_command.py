@@ -109,7 +109,7 @@ def test_stopped_and_resumed_equals_undisturbed(site, tmp_path):
     with np.load(state) as stored:
         arrays = dict(stored)
     arrays["key.json"] = np.array(
-        str(arrays["key.json"]).replace('"layout of the state": "2"', '"layout of the state": "1"')
+        str(arrays["key.json"]).replace('"layout of the state": "3"', '"layout of the state": "1"')
     )
     with state.open("wb") as file:
         np.savez(file, **arrays)

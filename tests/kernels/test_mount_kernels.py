@@ -157,11 +157,12 @@ def test_batch_is_one_by_one():
     assert together.free == PARAMETER_SETS["edwards-4"]
 
 
-def test_a_command_is_the_same_from_wherever_it_begins():
-    """Near by, far off, beyond the zenith, and without a guess."""
+@pytest.mark.parametrize("sag", [1e-3, 0.0])
+def test_a_command_is_the_same_from_wherever_it_begins(sag):
+    """Right beside it, near by, far off, beyond the zenith, and without a guess."""
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        values = {"pedestal_tilt_north_rad": 5e-3, "arm_normal_m": 0.3, "axis_offset_m": 0.1, "gravity_sag_rad": 1e-3}
+        values = {"pedestal_tilt_north_rad": 5e-3, "arm_normal_m": 0.3, "axis_offset_m": 0.1, "gravity_sag_rad": sag}
         mount = Mount(pivot_enu_m=np.zeros(3), actuators=(Actuator(), Actuator()), parameters=values)
         p, k = (rows[0] for rows in stack_mounts([mount]))
         prepared, state, wanted = np.empty(_kernels.N_PREPARED), np.empty(6), np.empty(3)
@@ -171,11 +172,12 @@ def test_a_command_is_the_same_from_wherever_it_begins():
         row[:3] /= np.linalg.norm(row[:3])
         row[4:8] = [*rng.normal(size=2) * 40.0, 30.0, 1.0]
         found = []
-        for near in (np.full(2, np.nan), None, None, np.array([rng.normal(), 1.1]), np.array([3.0, 2.0])):
-            near = found[0][0] + 0.01 * rng.normal(size=2) if near is None else near
+        for near in (np.full(2, np.nan), 0.01, 0.01, 5e-6, 5e-6, np.array([rng.normal(), 1.1]), np.array([3.0, 2.0])):
+            near = found[0][0] + near * rng.normal(size=2) if isinstance(near, float) else near
             counts = np.empty(2)
             assert _kernels.command_one(p, k, prepared, row, near, counts, state, wanted) == 0
-            found.append((near, counts))
-        for near, counts in found[1:]:
+            found.append((near, counts, wanted.copy()))
+        for near, counts, normal in found[1:]:
             np.testing.assert_allclose(near, found[0][0], atol=1e-12)
             np.testing.assert_allclose(counts, found[0][1], rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(normal, found[0][2], atol=1e-12)

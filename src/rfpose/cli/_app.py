@@ -14,7 +14,6 @@ import click
 from rfpose import __version__, interruption
 from rfpose.cli._support import CommonOptions, emit_json, in_options
 from rfpose.errors import RfposeError
-from rfpose.files import release_all
 
 __all__ = ["app"]
 
@@ -110,6 +109,8 @@ def _notes_to_stderr() -> Iterator[None]:
 def _leave(ctx: click.Context, message: str) -> NoReturn:
     """End after an interruption; another one, or a terminal that is gone, changes nothing any more."""
     with interruption.ignored():
+        from rfpose.files import release_all
+
         release_all()
         with contextlib.suppress(OSError):
             click.echo(f"\nrfpose: {message}", err=True)

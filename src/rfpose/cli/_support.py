@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import re
 import sys
 import threading
@@ -17,8 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 import click
 
 from rfpose.errors import InvalidInputError, RecordingError
-from rfpose.files import claim
-from rfpose.shown import plain
 
 if TYPE_CHECKING:
     from rfpose.recording.declared import Declared
@@ -203,6 +200,10 @@ def wants_json() -> bool:
 
 def emit_json(data: Mapping[str, Any]) -> None:
     """Print one JSON object on standard output; what is not finite becomes null."""
+    import json
+
+    from rfpose.shown import plain
+
     click.echo(json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False))
 
 
@@ -241,6 +242,8 @@ def outputs(
 
     See `rfpose.files.claim`.
     """
+    from rfpose.files import claim
+
     with claim(*paths, inputs=inputs, force=force, directories=directories):
         yield
     written = [path for path in paths if path is not None]

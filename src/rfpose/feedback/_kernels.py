@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rfpose.feedback.columns import MEASUREMENT, K, M, P
+from rfpose.feedback.columns import MEASUREMENT, PARAMETERS, K, M, P
 from rfpose.jit import kernel, kernel_lean, kernel_rows
 from rfpose.multilat.equations._kernels import factor, solve_factored
 
@@ -24,8 +24,12 @@ N_PREPARED = 22
 # Median of a Rayleigh variable in units of its sigma: the residual has two components.
 _RAYLEIGH_MEDIAN = 1.1774100225154747
 _STEP = 1e-6
+_SETTLING = 0.01  # a step that lowers the loss by less than this part of it was one near the least
+# the axis, from 0, that a parameter turns by itself; −1: it is about something else
+_AXIS_OF = np.array([int(name.split("_")[1]) - 1 if name.split("_")[1].isdigit() else -1 for name in PARAMETERS])
 _STEEP = 1.2  # an elevation that is safely on this side of the zenith [rad]
 _LAST = 1e-9  # so far off [rad], a step of Newton's method with slopes from nearby is the last: it leaves some 1e-13
+_NEAR = 2e-5  # so far off [rad], one step of second order with slopes from right there leaves as little
 _LITTLE = 1e-3  # an angle whose series ends beneath rounding after the terms taken [rad]
 
 
@@ -147,21 +151,27 @@ def bisector(m, centre, out):
     out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
 
 
+@kernel_lean
+def _sines(a, p, k, prepared, count, use, out):
+    """Sine and cosine of axis ``a`` (measurement, 2) at motor positions."""
+    for i in range(len(count)):
+        if use[i]:
+            angle = axis_angle(a, count[i, a], p, k, prepared)
+            out[i, 0], out[i, 1] = math.sin(angle), math.cos(angle)
+
+
 @kernel
-def _residuals(p, k, count, row, use, out):
-    """Modelled minus measured normal over sigma, (measurement, xyz); zero where not used."""
-    prepared = np.empty(N_PREPARED)
+def _residuals_at(p, prepared, sines_1, sines_2, row, use, out):
+    """Modelled minus measured normal over sigma, (measurement, xyz), at sines of the axes; zero where not used."""
     state = np.empty(6)
     wanted = np.empty(3)
     seen = np.empty(N_ROW)
-    prepare(p, k, prepared)
     for i in range(len(row)):
         if not use[i]:
             out[i, 0] = out[i, 1] = out[i, 2] = 0.0
             continue
-        azimuth = axis_angle(0, count[i, 0], p, k, prepared)
-        elevation = axis_angle(1, count[i, 1], p, k, prepared)
-        posture(azimuth, elevation, p, prepared, row[i, M.of_receiver_plane], state)
+        sa, ca, se, ce = sines_1[i, 0], sines_1[i, 1], sines_2[i, 0], sines_2[i, 1]
+        _pose(sa, ca, se, ce, p, prepared, row[i, M.of_receiver_plane], state)
         for j in range(N_ROW):
             seen[j] = row[i, j]
         for j in range(3):  # a drone's camera sits beside its antenna
@@ -169,6 +179,33 @@ def _residuals(p, k, count, row, use, out):
         bisector(seen, state[3:], wanted)
         for j in range(3):
             out[i, j] = (state[j] - wanted[j]) / row[i, M.sigma_rad]
+
+
+@kernel
+def _residuals(p, k, count, row, use, sines, out):
+    """The same at motor positions; the axes' sines (axis, measurement, 2) are written."""
+    prepared = np.empty(N_PREPARED)
+    prepare(p, k, prepared)
+    for a in range(2):
+        _sines(a, p, k, prepared, count, use, sines[a])
+    _residuals_at(p, prepared, sines[0], sines[1], row, use, out)
+
+
+@kernel
+def _residuals_beside(p, k, count, row, use, column, sines, out):
+    """The same where one parameter is another than where the axes' sines are from."""
+    prepared = np.empty(N_PREPARED)
+    prepare(p, k, prepared)
+    axis = _AXIS_OF[column]
+    if axis < 0:
+        _residuals_at(p, prepared, sines[0], sines[1], row, use, out)
+        return
+    moved = np.empty((len(count), 2))
+    _sines(axis, p, k, prepared, count, use, moved)
+    if axis == 0:
+        _residuals_at(p, prepared, moved, sines[1], row, use, out)
+    else:
+        _residuals_at(p, prepared, sines[0], moved, row, use, out)
 
 
 def residuals_batch(p: Array, k: Array, count: Array, row: Array, use: Array) -> Array:
@@ -180,8 +217,9 @@ def residuals_batch(p: Array, k: Array, count: Array, row: Array, use: Array) ->
 
 @kernel_rows
 def _residuals_rows(begin, end, p, k, count, row, use, out):
+    sines = np.empty((2, row.shape[1], 2))
     for h in range(begin, end):
-        _residuals(p[h], k[h], count[h], row[h], use[h], out[h])
+        _residuals(p[h], k[h], count[h], row[h], use[h], sines, out[h])
 
 
 def jacobian_batch(p: Array, k: Array, count: Array, row: Array, use: Array, free: Array, scale: Array) -> Array:
@@ -197,12 +235,14 @@ def _jacobian_rows(begin, end, p, k, count, row, use, free, scale, out):
         trial = p[h].copy()
         high = np.empty((row.shape[1], 3))
         low = np.empty((row.shape[1], 3))
+        sines = np.empty((2, row.shape[1], 2))
+        _residuals(trial, k[h], count[h], row[h], use[h], sines, low)
         for f in range(len(free)):
             step = 10.0 * _STEP * scale[f]
             trial[free[f]] = p[h, free[f]] + step
-            _residuals(trial, k[h], count[h], row[h], use[h], high)
+            _residuals_beside(trial, k[h], count[h], row[h], use[h], free[f], sines, high)
             trial[free[f]] = p[h, free[f]] - step
-            _residuals(trial, k[h], count[h], row[h], use[h], low)
+            _residuals_beside(trial, k[h], count[h], row[h], use[h], free[f], sines, low)
             trial[free[f]] = p[h, free[f]]
             for i in range(row.shape[1]):
                 for j in range(3):
@@ -309,6 +349,19 @@ def _turned(s, c, angle, by):
 
 
 @kernel_lean
+def _second(z, r, a, b, by_azimuth, by_elevation):
+    """What turns about axes ``z`` and ``r`` change a normal by to second order; to first order by ``a`` and ``b``."""
+    xx, yy, xy = 0.5 * by_azimuth * by_azimuth, 0.5 * by_elevation * by_elevation, by_azimuth * by_elevation
+    # axis 2 goes round with axis 1
+    c0, c1, c2 = xx * a[0] + xy * b[0], xx * a[1] + xy * b[1], xx * a[2] + xy * b[2]
+    return (
+        c1 * z[2] - c2 * z[1] + yy * (b[1] * r[2] - b[2] * r[1]),
+        c2 * z[0] - c0 * z[2] + yy * (b[2] * r[0] - b[0] * r[2]),
+        c0 * z[1] - c1 * z[0] + yy * (b[0] * r[1] - b[1] * r[0]),
+    )
+
+
+@kernel_lean
 def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, wanted):
     """Newton's method from axis angles; those that it ends with go to ``found``, NaN if it does not."""
     found[0] = found[1] = np.nan
@@ -317,6 +370,7 @@ def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, want
     moves = m[M.source_is_point] != 0.0 or m[M.target_is_point] != 0.0
     sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
     a0 = a1 = a2 = b0 = b1 = b2 = 0.0
+    near = False
     for _ in range(30):
         _pose(sa, ca, se, ce, p, prepared, 0.0, state)
         if moves or first:
@@ -338,23 +392,37 @@ def _command_from(azimuth, elevation, p, k, prepared, m, found, out, state, want
             r2 = prepared[6] * x + prepared[7] * y + prepared[8] * u
             a0, a1, a2 = n1 * z2 - n2 * z1, n2 * z0 - n0 * z2, n0 * z1 - n1 * z0
             b0, b1, b2 = n1 * r2 - n2 * r1, n2 * r0 - n0 * r2, n0 * r1 - n1 * r0
+            turn_1, turn_2 = (a0, a1, a2), (b0, b1, b2)
+            v0 = v1 = v2 = w0 = w1 = w2 = 0.0
             if moves:
                 # the centre goes with it, and with the centre the normal that is wanted
                 c0, c1, c2 = state[3] - prepared[PIVOT], state[4] - prepared[PIVOT + 1], state[5] - prepared[PIVOT + 2]
-                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
-                a0, a1, a2 = a0 - d0, a1 - d1, a2 - d2
+                v0, v1, v2 = _swept(m, state[3:], wanted, c1 * z2 - c2 * z1, c2 * z0 - c0 * z2, c0 * z1 - c1 * z0)
+                a0, a1, a2 = a0 - v0, a1 - v1, a2 - v2
                 x, y = sa * p[P.axis_offset_m], ca * p[P.axis_offset_m]
                 c0 -= prepared[0] * x + prepared[1] * y
                 c1 -= prepared[3] * x + prepared[4] * y
                 c2 -= prepared[6] * x + prepared[7] * y
-                d0, d1, d2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
-                b0, b1, b2 = b0 - d0, b1 - d1, b2 - d2
+                w0, w1, w2 = _swept(m, state[3:], wanted, c1 * r2 - c2 * r1, c2 * r0 - c0 * r2, c0 * r1 - c1 * r0)
+                b0, b1, b2 = b0 - w0, b1 - w1, b2 - w2
+            # slopes are exact but for sag, and where light grazes the mirror, so that it is not known what it sweeps
+            swept = abs(v0) + abs(v1) + abs(v2) + abs(w0) + abs(w1) + abs(w2) > 0.0
+            near = first and square < _NEAR * _NEAR and p[P.gravity_sag_rad] == 0.0 and (swept or not moves)
         aa, bb, ab = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2, a0 * b0 + a1 * b1 + a2 * b2
         ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
         determinant = aa * bb - ab * ab
         if determinant < 1e-14:
             return 1
         by_azimuth, by_elevation = (bb * ae - ab * be) / determinant, (aa * be - ab * ae) / determinant
+        if near and not done:
+            done = True
+            e0, e1, e2 = _second((z0, z1, z2), (r0, r1, r2), turn_1, turn_2, by_azimuth, by_elevation)
+            ae, be = a0 * e0 + a1 * e1 + a2 * e2, b0 * e0 + b1 * e1 + b2 * e2
+            by_azimuth -= (bb * ae - ab * be) / determinant
+            by_elevation -= (aa * be - ab * ae) / determinant
+            wanted[0] += v0 * by_azimuth + w0 * by_elevation
+            wanted[1] += v1 * by_azimuth + w1 * by_elevation
+            wanted[2] += v2 * by_azimuth + w2 * by_elevation
         azimuth += by_azimuth
         elevation += by_elevation
         if done:
@@ -440,35 +508,49 @@ def _prior_loss(p, free, prior_mean, prior_weight):
 
 
 @kernel
-def _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, gradient):
-    """Weighted normal matrix and gradient in scaled parameters, Jacobian by forward differences."""
+def _normal_equations(p, k, count, row, use, free, scale, sines, r, norm, cut, near, normal, gradient):
+    """Weighted normal matrix and gradient in scaled parameters, Jacobian by forward differences.
+
+    ``near`` the least loss the matrix is the loss' own second derivative, but for the curvature of residuals; else that
+    of a parabola which lies above the loss everywhere, since from afar the loss' own leads too far.
+    """
     n_free = len(free)
     m = len(row)
-    jacobian = np.empty((n_free, m, 3))
+    moved = np.empty((m, 3))
+    along = np.empty(n_free)
+    jacobian = np.empty((m, 3, n_free))
     trial = p.copy()
     for f in range(n_free):
-        step = _STEP * scale[f]
-        trial[free[f]] = p[free[f]] + step
-        _residuals(trial, k, count, row, use, jacobian[f])
+        trial[free[f]] = p[free[f]] + _STEP * scale[f]
+        _residuals_beside(trial, k, count, row, use, free[f], sines, moved)
         trial[free[f]] = p[free[f]]
         for i in range(m):
-            weight = 1.0 if norm[i] <= cut else math.sqrt(cut / norm[i])
             for j in range(3):
-                jacobian[f, i, j] = (jacobian[f, i, j] - r[i, j]) / _STEP * weight
-    for f in range(n_free):
-        total = 0.0
-        for i in range(m):
-            weight = 1.0 if norm[i] <= cut else math.sqrt(cut / norm[i])
-            for j in range(3):
-                total += jacobian[f, i, j] * r[i, j] * weight
-        gradient[f] = total
-        for g in range(f + 1):
-            total = 0.0
-            for i in range(m):
+                jacobian[i, j, f] = (moved[i, j] - r[i, j]) / _STEP
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    for i in range(m):
+        if not use[i]:
+            continue
+        weight = 1.0 if norm[i] <= cut else cut / norm[i]
+        for j in range(3):
+            for f in range(n_free):
+                scaled = weight * jacobian[i, j, f]
+                gradient[f] += scaled * r[i, j]
+                for g in range(f + 1):
+                    normal[f, g] += scaled * jacobian[i, j, g]
+        if near and norm[i] > cut:
+            # along the residual the loss is straight
+            for f in range(n_free):
+                along[f] = 0.0
                 for j in range(3):
-                    total += jacobian[f, i, j] * jacobian[g, i, j]
-            normal[f, g] = total
-            normal[g, f] = total
+                    along[f] += jacobian[i, j, f] * r[i, j] / norm[i]
+            for f in range(n_free):
+                for g in range(f + 1):
+                    normal[f, g] -= weight * along[f] * along[g]
+    for f in range(n_free):
+        for g in range(f):
+            normal[g, f] = normal[f, g]
 
 
 @kernel
@@ -488,9 +570,12 @@ def _fit_one(
     step = np.empty(n_free)
     trial = p.copy()
     weight = np.empty(n_free)
+    sines = np.empty((2, m, 2))
+    sines_new = np.empty((2, m, 2))
     damping = 1e-3
-    _residuals(p, k, count, row, use, r)
+    _residuals(p, k, count, row, use, sines, r)
     noise = 1.0
+    near = False
     for iteration in range(max_iteration):
         middle = _median_norm(r, use, norm)
         if not middle < np.inf:
@@ -501,7 +586,7 @@ def _fit_one(
         for f in range(n_free):
             weight[f] = prior_weight[f] * noise * noise
         cost = _loss(norm, use, cut) + _prior_loss(p, free, prior_mean, weight)
-        _normal_equations(p, k, count, row, use, free, scale, r, norm, cut, normal, gradient)
+        _normal_equations(p, k, count, row, use, free, scale, sines, r, norm, cut, near, normal, gradient)
         for f in range(n_free):
             gradient[f] += weight[f] * (p[free[f]] - prior_mean[f]) * scale[f]
             normal[f, f] += weight[f] * scale[f] * scale[f]
@@ -524,7 +609,7 @@ def _fit_one(
                 for f in range(n_free):
                     value = p[free[f]] + step[f] * scale[f]
                     trial[free[f]] = min(max(value, low[f]), high[f])
-                _residuals(trial, k, count, row, use, r_new)
+                _residuals(trial, k, count, row, use, sines_new, r_new)
                 _median_norm(r_new, use, norm_new)
                 fresh = _loss(norm_new, use, cut) + _prior_loss(trial, free, prior_mean, weight)
                 if fresh <= cost:
@@ -535,11 +620,11 @@ def _fit_one(
         if not improved:
             return iteration + 1, noise
         damping = max(damping * 0.1, 1e-9)
+        near = gain < _SETTLING * cost
         for f in range(n_free):
             p[free[f]] = trial[free[f]]
-        for i in range(m):
-            for j in range(3):
-                r[i, j] = r_new[i, j]
+        r, r_new = r_new, r
+        sines, sines_new = sines_new, sines
         if gain <= 1e-9 * cost + 1e-22:
             return iteration + 1, noise
     return -max_iteration, noise

@@ -61,6 +61,7 @@ __all__ = [
     "row_status",
     "solve",
     "sun_convention",
+    "working_alone",
 ]
 
 _TURNS = 4
@@ -208,23 +209,17 @@ def solve(
     settings: FitSettings,
 ) -> FieldCalibration:
     """Fit rows of parameters to rows of measurements and say what is known of the result."""
-    index = columns_of(free)
-    scale = scales_of(free)
-    low, high, mean, weight = _limits(p[:, index], free, settings)
-    enough = use.sum(axis=1) >= _least(free, settings)
-    masked = use & enough[:, None]
-    start = p.copy()
-    start[:, index] = np.clip(start[:, index], low, high)
-    problem = FitBatch(k=k, count=count, row=row, use=masked, index=index, scale=scale, prior_weight=weight)
-    bounds = (low, high, mean)
-    fitted, iterations, noise = _minimise(start, problem, bounds, settings)
+    problem, enough = _problem(k, count, row, use, free, settings)
+    fitted, iterations, noise = _minimise(p, problem, free, settings)
+    if settings.priors and not settings.sigma_known:
+        noise = _noise(problem, fitted, noise)
     carried = problem.carried(fitted, noise)
-    redundancy = 2.0 * masked.sum(axis=1) - carried
+    redundancy = 2.0 * problem.use.sum(axis=1) - carried
     if not settings.sigma_known and not settings.priors:
-        noise = noise_with_assumed(noise, masked, redundancy)
+        noise = noise_with_assumed(noise, problem.use, redundancy)
     status = np.where(iterations < 0, FitStatus.NOT_SETTLED, FitStatus.OK).astype(np.int8)
     status[~enough] = FitStatus.TOO_FEW
-    working = fitted[:, index]
+    working = fitted[:, problem.index]
     working[~enough] = np.nan
     residual_noise = np.where(enough & (noise > 0.0), noise, 1.0)
     noise = np.where(enough, np.maximum(noise, settings.least_noise), np.nan)
@@ -253,16 +248,57 @@ def solve(
     )
 
 
+def working_alone(
+    p: FloatArray,
+    k: FloatArray,
+    count: FloatArray,
+    row: FloatArray,
+    use: npt.NDArray[np.bool_],
+    free: tuple[str, ...],
+    settings: FitSettings,
+) -> FloatArray:
+    """Fit as `solve` does and return its ``working`` (heliostat, free), without working out what is known of it."""
+    problem, enough = _problem(k, count, row, use, free, settings)
+    working = _minimise(p, problem, free, settings)[0][:, problem.index]
+    working[~enough] = np.nan
+    return working
+
+
+def _problem(
+    k: FloatArray,
+    count: FloatArray,
+    row: FloatArray,
+    use: npt.NDArray[np.bool_],
+    free: tuple[str, ...],
+    settings: FitSettings,
+) -> tuple[FitBatch, npt.NDArray[np.bool_]]:
+    """Return what is to be fitted, and for which heliostats enough was measured (heliostat,)."""
+    enough = use.sum(axis=1) >= _least(free, settings)
+    weight = np.array([1.0 / settings.priors[name][1] ** 2 if name in settings.priors else 0.0 for name in free])
+    problem = FitBatch(
+        k=k,
+        count=count,
+        row=row,
+        use=use & enough[:, None],
+        index=columns_of(free),
+        scale=scales_of(free),
+        prior_weight=weight,
+    )
+    return problem, enough
+
+
 def _minimise(
-    start: FloatArray, problem: FitBatch, bounds: tuple[FloatArray, FloatArray, FloatArray], settings: FitSettings
+    p: FloatArray, problem: FitBatch, free: tuple[str, ...], settings: FitSettings
 ) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
-    """Return fitted parameters, iterations and noise in units of the stated sigma.
+    """Return parameters fitted from ``p``, iterations, and the noise that weighed them, in units of the stated sigma.
 
     Priors and residuals are weighed by the noise, and how much of the residuals the parameters took up depends on
     the priors: the noise is found in turns with the fit, beginning with what is stated. Found inside the fit it
     would go to zero, and the priors with it, as soon as the parameters reach every point.
     """
-    low, high, mean = bounds
+    low, high, mean = _limits(p[:, problem.index], free, settings)
+    start = p.copy()
+    start[:, problem.index] = np.clip(start[:, problem.index], low, high)
 
     def kernel(p: FloatArray, row: FloatArray, known: bool) -> Any:
         return _kernels.fit_batch(
@@ -274,28 +310,33 @@ def _minimise(
         found: tuple[FloatArray, npt.NDArray[np.int64], FloatArray] = kernel(start, problem.row, settings.sigma_known)
         return found
     noise, fitted = np.ones(len(start)), start
-    for _ in range(_TURNS):
-        row = problem.row.copy()
-        row[..., M.sigma_rad] *= noise[:, None]
+    row = problem.row.copy()
+    for turn in range(_TURNS):
+        if turn:
+            noise = _noise(problem, fitted, noise)
+        row[..., M.sigma_rad] = problem.row[..., M.sigma_rad] * noise[:, None]
         fitted, iterations, _ = kernel(fitted, row, True)
-        redundancy = 2.0 * problem.use.sum(axis=1) - problem.carried(fitted, noise)
-        noise = noise_with_assumed(problem.scatter(fitted), problem.use, redundancy)
     return fitted, iterations, noise
+
+
+def _noise(problem: FitBatch, fitted: FloatArray, weighed_by: FloatArray) -> FloatArray:
+    """Return the noise by a fit that was weighed by another one, in units of the stated sigma (heliostat,)."""
+    redundancy = 2.0 * problem.use.sum(axis=1) - problem.carried(fitted, weighed_by)
+    return noise_with_assumed(problem.scatter(fitted), problem.use, redundancy)
 
 
 def _limits(
     start: FloatArray, free: tuple[str, ...], settings: FitSettings
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Bounds and priors of the free parameters as arrays."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Bounds and means of the free parameters as arrays."""
     low, high = np.full_like(start, -np.inf), np.full_like(start, np.inf)
-    mean, weight = start.copy(), np.zeros(len(free))
+    mean = start.copy()
     for f, name in enumerate(free):
         if name in settings.bounds:
             low[:, f], high[:, f] = settings.bounds[name]
         if name in settings.priors:
-            mean[:, f], sigma = settings.priors[name]
-            weight[f] = 1.0 / sigma**2
-    return low, high, mean, weight
+            mean[:, f] = settings.priors[name][0]
+    return low, high, mean
 
 
 def _least(free: tuple[str, ...], settings: FitSettings) -> int:
@@ -350,7 +391,7 @@ def _median_with_other_zeros_rad(mount: Mount, measurements: Measurements) -> fl
     free = PARAMETER_SETS["offsets"]
     p, k = stack_mounts([mount])
     count, row = measurements.count[None].copy(), measurements.row[None].copy()
-    (values,) = solve(p, k, count, row, np.ones((1, len(measurements)), np.bool_), free, FitSettings()).working
+    (values,) = working_alone(p, k, count, row, np.ones((1, len(measurements)), np.bool_), free, FitSettings())
     if not np.isfinite(values).all():
         return float("inf")
     turned = mount.replace(**dict(zip(free, values.tolist(), strict=True)))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.feedback import _kernels
 from rfpose.feedback.calibrated import PARAMETER_SETS, CalibratedMount, FieldCalibration, FitSettings, ParameterChoice
-from rfpose.feedback.calibration import fit, row_status, solve
+from rfpose.feedback.calibration import fit, row_status, solve, working_alone
 from rfpose.feedback.columns import columns_of
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount, stack_mounts
@@ -34,6 +34,7 @@ __all__ = [
     "fit_chosen",
     "held_out_sigma",
     "refit",
+    "refit_errors_rad",
     "with_priors",
 ]
 
@@ -132,7 +133,8 @@ def choose(
     errors: dict[str, FloatArray] = {}
     for name, free in sets.items():
         # a single measurement leaves none to predict it from
-        error = refit(mount, measurements, stacked, free, with_priors(mount, free, settings))[0] if len(held) else held
+        some = with_priors(mount, free, settings)
+        error = refit_errors_rad(mount, measurements, stacked, free, some) if len(held) else held
         errors[name] = np.where(held, error, np.nan)
     edges = np.cumsum([0, *(len(fold) for fold in folds)])
     return tuple(
@@ -152,7 +154,7 @@ def held_out_sigma(
     if not len(held):
         return float("nan")
     usable = held.any(axis=0)
-    error, _ = refit(mount, measurements, usable & ~held, tuple(free), settings or FitSettings())
+    error = refit_errors_rad(mount, measurements, usable & ~held, tuple(free), settings or FitSettings())
     error = error[held] / np.broadcast_to(measurements.sigma_rad, held.shape)[held]
     return float(np.median(error)) / RAYLEIGH_MEDIAN
 
@@ -170,7 +172,7 @@ def chosen_errors_rad(
     out = np.full(masks.shape, np.nan)
     for free in {choice.free for choice in choices}:
         chose = np.array([choice.free == free for choice in choices])
-        out[chose], _ = refit(mount, measurements, masks[chose], free, with_priors(mount, free, settings))
+        out[chose] = refit_errors_rad(mount, measurements, masks[chose], free, with_priors(mount, free, settings))
     return out
 
 
@@ -234,13 +236,37 @@ def refit(
     masks : (fit, measurement)
         What each fit may use.
     """
-    n = len(masks)
-    p, k = stack_mounts([mount])
-    p, k = np.repeat(p, n, axis=0), np.repeat(k, n, axis=0)
-    count = np.repeat(measurements.count[None], n, axis=0)
-    row = np.repeat(measurements.row[None], n, axis=0)
+    p, k, count, row = _repeated(mount, measurements, len(masks))
     found = solve(p, k, count, row, masks, free, settings)
     p[:, columns_of(free)] = found.working
-    residual = _kernels.residuals_batch(p, k, count, row, np.ones_like(masks))
-    chord = np.linalg.norm(residual, axis=-1) * measurements.sigma_rad
-    return 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)), found
+    return _errors_rad(p, k, count, row, measurements.sigma_rad), found
+
+
+def refit_errors_rad(
+    mount: Mount,
+    measurements: Measurements,
+    masks: npt.NDArray[np.bool_],
+    free: tuple[str, ...],
+    settings: FitSettings,
+) -> FloatArray:
+    """Return the errors of `refit` (fit, measurement) [rad] without what is known of each fit, which costs time."""
+    p, k, count, row = _repeated(mount, measurements, len(masks))
+    p[:, columns_of(free)] = working_alone(p, k, count, row, masks, free, settings)
+    return _errors_rad(p, k, count, row, measurements.sigma_rad)
+
+
+def _repeated(
+    mount: Mount, measurements: Measurements, n: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Parameters, constants, counts and rows of a mount and what was measured of it, so many times over."""
+    p, k = stack_mounts([mount])
+    one = (p, k, measurements.count[None], measurements.row[None])
+    p, k, count, row = (np.repeat(values, n, axis=0) for values in one)
+    return p, k, count, row
+
+
+def _errors_rad(p: FloatArray, k: FloatArray, count: FloatArray, row: FloatArray, sigma_rad: FloatArray) -> FloatArray:
+    """Angles between modelled and measured normals (fit, measurement) [rad]."""
+    residual = _kernels.residuals_batch(p, k, count, row, np.ones(row.shape[:2], np.bool_))
+    chord = np.linalg.norm(residual, axis=-1) * sigma_rad
+    return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0)))

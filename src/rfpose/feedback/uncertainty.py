@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -62,15 +61,20 @@ class FitBatch:
         out: FloatArray = _kernels.jacobian_batch(
             p[s], self.k[s], self.count[s], self.row[s], self.use[s], self.index, self.scale
         )
-        return np.nan_to_num(np.where(self.use[s][..., None, None], out, 0.0), posinf=0.0, neginf=0.0)
+        # zero where nothing takes part; beyond an actuator's reach there is no number
+        finite = np.isfinite(out)
+        if not finite.all():
+            out[~finite] = 0.0
+        return out
 
     def scatter(self, p: FloatArray) -> FloatArray:
         """Sigma of the residuals by their median, in stated sigmas (heliostat,); zero without measurements."""
         norm = np.linalg.norm(self.residual(p, slice(None)), axis=-1)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a heliostat without measurements
-            median = np.nanmedian(np.where(self.use, norm, np.nan), axis=1)
-        return np.asarray(np.nan_to_num(median) / RAYLEIGH_MEDIAN)
+        # numpy's own median goes row by row where some are left out
+        known = self.use & ~np.isnan(norm)
+        ordered, n, row = np.sort(np.where(known, norm, np.inf), axis=1), known.sum(axis=1), np.arange(len(norm))
+        median = 0.5 * (ordered[row, np.maximum(n - 1, 0) // 2] + ordered[row, np.minimum(n // 2, norm.shape[1] - 1)])
+        return np.where(n > 0, median, 0.0) / RAYLEIGH_MEDIAN
 
     def carried(self, p: FloatArray, noise: FloatArray) -> FloatArray:
         """Parameters that the data carry, priors left out (heliostat,): the trace of their share of the information."""

@@ -16,7 +16,7 @@ from rfpose.errors import InvalidInputError
 from rfpose.feedback.calibration import FieldCalibration, FitSettings, FitStatus, resolve_free, row_status
 from rfpose.feedback.measurements import Measurements
 from rfpose.feedback.mount import Mount
-from rfpose.feedback.selection import AUTO, chosen_errors_rad, refit
+from rfpose.feedback.selection import AUTO, chosen_errors_rad, refit, refit_errors_rad
 
 __all__ = ["HeldOut", "Rolling", "chronological_split", "leave_one_out_rad", "random_splits", "rolling_refit"]
 
@@ -124,7 +124,7 @@ def leave_one_out_rad(
     """Return the error of each measurement under the fit to all others (measurement,) [rad]; NaN where unusable."""
     usable = row_status(mount, measurements) == 0
     masks = usable & ~np.eye(len(measurements), dtype=np.bool_)
-    error, _ = refit(mount, measurements, masks, resolve_free(free), settings or FitSettings())
+    error = refit_errors_rad(mount, measurements, masks, resolve_free(free), settings or FitSettings())
     return np.where(usable, np.diagonal(error), np.nan)
 
 

@@ -46,7 +46,7 @@ class TrackChanges:
 
 
 _AS_IT_STANDS = TrackChanges()
-_STATE_LAYOUT = "2"
+_STATE_LAYOUT = "3"
 """Told apart from unfinished work that was kept with other arrays, which cannot be gone on from."""
 _KEEPING = 0.02
 """Of the time of others, so much may go into keeping what each result adds: it is a day, which took them long."""

@@ -19,9 +19,12 @@ from rfpose.feedback.calibration import (
     normal_errors_rad,
     predict,
 )
+from rfpose.feedback.columns import columns_of, scales_of
 from rfpose.feedback.design import forecast, next_postures
 from rfpose.feedback.measurements import Measurements, join
-from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, command, posture
+from rfpose.feedback.mount import PARAMETERS, Actuator, Mount, command, posture, stack_mounts
+from rfpose.feedback.selection import refit, refit_errors_rad, with_priors
+from rfpose.feedback.uncertainty import RAYLEIGH_MEDIAN, FitBatch
 from rfpose.feedback.validation import chronological_split, leave_one_out_rad, random_splits, rolling_refit
 from rfpose.sun import Location
 
@@ -173,6 +176,32 @@ def test_leave_one_out_is_the_refit_without_it():
     left_out = leave_one_out_rad(START, made, free="edwards-4")
     without = fit(START, made.take(np.arange(12) != 5), free="edwards-4")
     assert left_out[5] == pytest.approx(normal_errors_rad(without.mount, made)[5], rel=1e-6)
+
+
+def test_errors_alone_are_those_of_the_refit_with_all_that_is_known_of_it():
+    made = spots(np.random.default_rng(14), 21)
+    masks = np.random.default_rng(15).random((6, 21)) < 0.7
+    masks[3, 1:] = False
+    masks[4] = False
+    free = PARAMETER_SETS["edwards-4"]
+    for settings in (with_priors(START, free), FitSettings()):
+        errors, found = refit(START, made, masks, free, settings)
+        np.testing.assert_array_equal(refit_errors_rad(START, made, masks, free, settings), errors)
+        assert np.isnan(errors[4]).all() == (found.status[4] == FitStatus.TOO_FEW)
+
+
+def test_scatter_is_the_median_of_what_takes_part():
+    made = spots(np.random.default_rng(16), 9)
+    p, k = (np.repeat(rows, 4, axis=0) for rows in stack_mounts([START]))
+    use = np.ones((4, 9), np.bool_)
+    use[1, 2], use[2] = False, False
+    batch = FitBatch(
+        k=k, count=np.repeat(made.count[None], 4, axis=0), row=np.repeat(made.row[None], 4, axis=0), use=use,
+        index=columns_of(()), scale=scales_of(()), prior_weight=np.zeros(0),
+    )  # fmt: skip
+    norm = np.linalg.norm(batch.residual(p, slice(None))[0], axis=-1)
+    wanted = [np.median(norm[row]) if row.any() else 0.0 for row in use]
+    np.testing.assert_allclose(batch.scatter(p), np.array(wanted) / RAYLEIGH_MEDIAN, rtol=1e-12)
 
 
 def test_splits_keep_what_they_say_apart():

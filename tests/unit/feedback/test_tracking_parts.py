@@ -383,7 +383,7 @@ def test_the_kernels_swing_has_the_winds_variance_and_rings_down():
     # a motor that stops: free vibration from the speed that it took away
     one, v = np.zeros(_kernels.N_STATE), 40e-3
     one[_kernels.RATE] = v
-    w, still = mode.natural_radps, np.zeros(4)
+    w, still = mode.natural_radps, np.zeros(2)
     wd = w * np.sqrt(1.0 - 0.02**2)
     for t in range(1, 20):
         _kernels._swing(loop, still, 0.0, 0.0, one)
@@ -395,7 +395,7 @@ def test_the_kernels_swing_has_the_winds_variance_and_rings_down():
 def test_a_stiff_structure_draws_nothing_and_does_not_swing():
     gusts = Gusts(changed(structure={"natural_hz": 0.0}))
     assert not gusts.swings
-    assert gusts.draw_swing(np.random.default_rng(0), (3, 100)).shape == (3, 0, 4)
+    assert gusts.draw_swing(np.random.default_rng(0), (3, 100)).shape == (3, 0, 2)
     assert not gusts.swing_rad(np.random.default_rng(0), (3, 5)).any()
     soft = Gusts(changed(structure={"natural_hz": 2.2}))
     drawn = soft.swing_rad(np.random.default_rng(0), (20_000,))

@@ -157,7 +157,7 @@ class Heliostats:
         """Take sun angles over, unless they are further from fresh ones than the sun moves."""
         age = said_s - self.sun_s[index]
         farthest = self.settings.sun_jump_rad + EARTH_RADPS * age
-        east, north, up = (sun_enu - self.sun_enu[index]).T
+        east, north, up = (sun_enu - self.sun_enu.take(index, axis=0)).T
         step = np.sqrt(east * east + north * north + up * up)
         ok = (step <= farthest) | ~(age <= fresh_s)
         if not ok.all():

@@ -184,7 +184,7 @@ class Wire:
         if not arrived.any():
             return
         for i, receive in enumerate((self._hear_sun, self._hear_question, self._hear_answer)):
-            index = np.flatnonzero(arrived[i])
+            index = arrived[i].nonzero()[0]
             if index.size:
                 at_s = self.arrival_s[i, index]
                 self.arrival_s[i, index] = np.inf
@@ -229,7 +229,7 @@ class Wire:
     def _hear_answer(self, index: npt.NDArray[np.int64], at_s: FloatArray, now_s: float) -> None:
         """Take a report over; an order that was obeyed or refused is done with."""
         self.reported_mode[index] = self.heliostats.mode[index]
-        axis = self.heliostats.axis_rad[index]
+        axis = self.heliostats.axis_rad.take(index, axis=0)
         known = np.where(np.isnan(axis), 0.0, axis)
         self.reported_axis_rad[index] = packets.angles_from_counts(packets.counts_from_angles(known))
         self.reported_s[index] = at_s

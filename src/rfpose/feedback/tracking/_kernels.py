@@ -104,10 +104,9 @@ class Loop(NamedTuple):
     v_y: float
     v_v: float
     """Transition of the structure's swing over a servo step."""
-    root_y: float
-    root_vy: float
-    root_v: float
-    """Its noise, lower triangle."""
+    kick_y: float
+    kick_v: float
+    """What a random number adds to it."""
     swing_right: float
     swing_up: float
     """Its standard deviation [rad]."""
@@ -191,7 +190,7 @@ class Weather(NamedTuple):
     gust: npt.NDArray[np.float32]
     """(mirror, step) [m/s]."""
     swing: npt.NDArray[np.float32]
-    """(mirror, step, 4) of variance one."""
+    """(mirror, step, 2) right, up, of variance one."""
 
 
 class Readings(NamedTuple):
@@ -206,7 +205,9 @@ class Readings(NamedTuple):
     lost: npt.NDArray[np.uint8]
     """(mirror, frame)"""
     outage: npt.NDArray[np.uint8]
-    """(mirror, step) 0, or which one is on, from 1."""
+    """(pattern, step) 0, or which one is on, from 1,"""
+    pattern: npt.NDArray[np.int64]
+    """(mirror,) and whose of these patterns is whose."""
     drift: FloatArray
     """(mirror,) of the receivers' plane or the sensor by day, times the heat [rad]."""
     null: FloatArray
@@ -235,7 +236,7 @@ class Tally(NamedTuple):
     """(mirror, outage, 4)"""
     hours: FloatArray
     """(mirror, 24, 2) steps and squared errors."""
-    histogram: npt.NDArray[np.int64]
+    histogram: npt.NDArray[np.int32]
     """(mirror, N_BIN) of errors."""
 
 
@@ -485,9 +486,9 @@ def _swing(loop, noise, rate_right, rate_up, state):
         # the mirror stays behind what holds it
         v = state[SWING + 2 * a + 1] - (rate - state[RATE + a]) / loop.servo_s
         scale = loop.swing_right if a == 0 else loop.swing_up
-        w0, w1 = noise[2 * a], noise[2 * a + 1]
-        state[SWING + 2 * a] = loop.y_y * y + loop.y_v * v + scale * loop.root_y * w0
-        state[SWING + 2 * a + 1] = loop.v_y * y + loop.v_v * v + scale * (loop.root_vy * w0 + loop.root_v * w1)
+        push = scale * noise[a]
+        state[SWING + 2 * a] = loop.y_y * y + loop.y_v * v + loop.kick_y * push
+        state[SWING + 2 * a + 1] = loop.v_y * y + loop.v_v * v + loop.kick_v * push
         state[RATE + a] = rate
 
 
@@ -522,7 +523,8 @@ def _track(h, first, end, tasks, stretch, room):
     )  # fmt: skip
     gust, swing = stretch.surroundings.gust[h], stretch.surroundings.swing[h]
     noise, spread, bias = stretch.readings.noise[h], stretch.readings.spread[h], stretch.readings.bias[h]
-    lost, outage, drift = stretch.readings.lost[h], stretch.readings.outage[h], stretch.readings.drift[h]
+    lost, drift = stretch.readings.lost[h], stretch.readings.drift[h]
+    outage = stretch.readings.outage[stretch.readings.pattern[h]]
     null = stretch.readings.null[h]
     state, ring, light = stretch.memory.state[h], stretch.memory.ring[h], stretch.memory.light[h]
     total, by_mode, by_outage = stretch.tally.total[h], stretch.tally.by_mode[h], stretch.tally.by_outage[h]
@@ -550,9 +552,22 @@ def _track(h, first, end, tasks, stretch, room):
     stood_1 = stood_2 = np.nan
     axis_1 = axis_2 = 0.0
     turned = True
+    phase = (step0 + first) % loop.interval - 1
+    since_due = (step0 + first - loop.latency) % loop.interval - 1
+    since_kept = first % stride - 1
     for s in range(first, end):
         g = step0 + s
-        tick = g % loop.interval == 0
+        phase += 1
+        if phase == loop.interval:
+            phase = 0
+        tick = phase == 0
+        since_due += 1
+        if since_due == loop.interval:
+            since_due = 0
+        since_kept += 1
+        if since_kept == stride:
+            since_kept = 0
+        keep = since_kept == 0
         if s % 16 == 0 or s == first:
             # wherever a stretch is cut, the same lean
             p[P.pedestal_tilt_north_rad] = built[P.pedestal_tilt_north_rad] + lean[0] * heat[s - s % 16]
@@ -569,7 +584,7 @@ def _track(h, first, end, tasks, stretch, room):
         elif tick or (renew and s == first):
             fresh = state[STARTED] == 0.0
             reached = True
-            ahead = loop.interval - g % loop.interval
+            ahead = loop.interval - phase
             word = min(g // loop.control - (step0 + first) // loop.control, len(age) - 1)
             if fresh or (renew and s == first):
                 _copy(sun[s], seen)
@@ -617,7 +632,7 @@ def _track(h, first, end, tasks, stretch, room):
                 state[STARTED] = 1.0
         # a measurement has arrived
         due = g - loop.latency
-        if loop.feedback != NO_FEEDBACK and due >= 0 and due % loop.interval == 0:
+        if loop.feedback != NO_FEEDBACK and due >= 0 and since_due == 0:
             entry = ring[(due // loop.interval) % N_RING]
             seconds = loop.interval * loop.servo_s
             used = entry[0] == USED and duty == TRACK
@@ -674,13 +689,16 @@ def _track(h, first, end, tasks, stretch, room):
                     state[SHIFT + i] += guess[i]
                 state[LEARNED] = state[INNOVATION] = state[INNOVATION + 1] = 0.0
         # motors, gears
-        part = (g % loop.interval) / loop.interval
+        part = phase / loop.interval
         for a in range(2):
             want = state[COMMAND + a]
             if duty != GO:
                 want += (state[NEXT + a] - state[COMMAND + a]) * part + state[SLIP + a] * k[K.counts_per_unit + a]
                 want = min(max(want, k[K.lowest_count + a]), k[K.highest_count + a])
             before = state[MOTOR + a]
+            if state[GOAL + a] == before and abs(want - before) <= (drive_1.dead_band if a == 0 else drive_2.dead_band):
+                change[a] = state[MOVED + a] = 0.0
+                continue
             change[a] = state[AXIS + a]
             state[MOTOR + a], state[AXIS + a], state[GOAL + a] = stepper_step(
                 want, before, state[AXIS + a], state[GOAL + a], drive_1 if a == 0 else drive_2, 1.0
@@ -720,7 +738,7 @@ def _track(h, first, end, tasks, stretch, room):
             _copy(sun[s], to_receiver)
         angle = _off(true, sun[s], to_aim, wanted)
         facing = max(true[0] * sun[s, 0] + true[1] * sun[s, 1] + true[2] * sun[s, 2], 0.0)
-        if tick or s % stride == 0 or s == end - 1:
+        if tick or keep or s == end - 1:
             # what the receiver gets, whatever the mirror is told to aim at
             off = angle if scored else _off(true, sun[s], to_receiver, hoped)
             offered = facing
@@ -781,7 +799,7 @@ def _track(h, first, end, tasks, stretch, room):
                     if dark:
                         by_outage[outage[s] - 1, OUT_ENERGY] += energy
                         by_outage[outage[s] - 1, OUT_CAUGHT] += caught
-        if s % stride == 0:
+        if keep:
             i_trace = s // stride
             trace_error[i_trace] = angle if scored and state[UNREACHABLE] == 0.0 else np.nan
             trace_light[i_trace, 0], trace_light[i_trace, 1] = light[0], light[1]

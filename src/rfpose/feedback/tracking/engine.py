@@ -41,6 +41,7 @@ class StretchDraws:
     noise: npt.NDArray[np.float32]
     lost: npt.NDArray[np.uint8]
     outage: npt.NDArray[np.uint8]
+    pattern: npt.NDArray[np.int64]
     spread: FloatArray
     bias: FloatArray
 
@@ -131,6 +132,7 @@ class MethodEngine:
                 bias=draws.bias,
                 lost=draws.lost,
                 outage=draws.outage,
+                pattern=draws.pattern,
                 drift=self._drift_rad,
                 null=field.sensor_bias_rad,
             ),
@@ -192,7 +194,7 @@ def empty_tally(n: int, n_outage: int) -> _kernels.Tally:
         by_mode=np.zeros((n, len(Mode), 3)),
         by_outage=np.zeros((n, max(n_outage, 1), 4)),
         hours=np.zeros((n, 24, 2)),
-        histogram=np.zeros((n, _kernels.N_BIN), np.int64),
+        histogram=np.zeros((n, _kernels.N_BIN), np.int32),
     )
 
 

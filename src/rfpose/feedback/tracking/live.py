@@ -322,7 +322,8 @@ class LiveField:
             swing=plant.gusts.draw_swing(generator(plant.seed, 16, self._at), (n, n_step)),
             noise=noise,
             lost=lost,
-            outage=np.zeros((n, n_step), np.uint8),
+            outage=np.zeros((1, n_step), np.uint8),
+            pattern=np.zeros(n, np.int64),
             spread=self._radio_errors.spread_rad,
             bias=self._radio_errors.bias_rad,
         )

@@ -138,11 +138,11 @@ def _sky(scenario: Scenario) -> dict[str, Any]:
 def _swing(gusts: Gusts) -> dict[str, Any]:
     """Return how the structure swings."""
     (y_y, y_v), (v_y, v_v) = gusts.transition.tolist()
-    (root_y, _), (root_vy, root_v) = gusts.root.tolist()
+    kick_y, kick_v = gusts.kick.tolist()
     right, up = gusts.swing_sigma_rad.tolist()
     return {
-        "swings": gusts.swings, "y_y": y_y, "y_v": y_v, "v_y": v_y, "v_v": v_v, "root_y": root_y,
-        "root_vy": root_vy, "root_v": root_v, "swing_right": right, "swing_up": up,
+        "swings": gusts.swings, "y_y": y_y, "y_v": y_v, "v_y": v_y, "v_v": v_v, "kick_y": kick_y, "kick_v": kick_v,
+        "swing_right": right, "swing_up": up,
     }  # fmt: skip
 
 

@@ -209,9 +209,12 @@ class Operation:
         goal = np.where(np.isfinite(goal), goal, state[:, _kernels.MOTOR : _kernels.MOTOR + 2])
         renew = follows & ((self._last_duty == _kernels.GO) | (aim != self._last_aim).any(axis=1))
         self._last_duty, self._last_aim = duty, aim
-        since = np.array([word.time_s / self._servo_s - s for word in words])
-        age = np.stack([word.sun_age_s / self._servo_s for word in words], axis=1) - since
-        heard = np.stack([word.sun_enu for word in words], axis=1)
+        age, heard = np.empty((len(mode), len(words))), np.empty((len(mode), len(words), 3))
+        for i, word in enumerate(words):
+            age[:, i] = word.sun_age_s / self._servo_s - (word.time_s / self._servo_s - s)
+            heard[:, i] = word.sun_enu
+        if not follows.all():
+            age[~follows], heard[~follows] = 0.0, 0.0
         return _kernels.Tasks(
             duty=duty,
             renew=renew.astype(np.uint8),
@@ -219,8 +222,8 @@ class Operation:
             mode=mode,
             aim=aim,
             goal=goal,
-            heard=np.where(follows[:, None, None], heard, 0.0),
-            age=np.where(follows[:, None], age, 0.0),
+            heard=heard,
+            age=age,
         )
 
     def _valid(self, state: FloatArray) -> npt.NDArray[np.bool_]:

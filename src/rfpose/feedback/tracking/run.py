@@ -67,7 +67,7 @@ class MethodSums:
     by_mode: FloatArray
     by_outage: FloatArray
     hours: FloatArray
-    histogram: npt.NDArray[np.int64]
+    histogram: npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

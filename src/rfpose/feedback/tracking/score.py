@@ -211,7 +211,7 @@ def score(sums: MethodSums) -> Score:
     )
 
 
-def quantile(histogram: npt.NDArray[np.int64], part: float) -> FloatArray:
+def quantile(histogram: npt.NDArray[np.integer], part: float) -> FloatArray:
     """Return a quantile of each row's normal errors (row,) [rad], linear in the logarithm within a bin."""
     cumulated = np.cumsum(histogram, axis=1)
     wanted = part * cumulated[:, -1:]

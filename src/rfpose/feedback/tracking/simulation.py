@@ -176,26 +176,31 @@ class TrackingSimulation:
             errors = self.radio.errors(plant.wanted_normal_enu(day, (segment.first + segment.end) // 2), rng)
             spread, bias = errors.spread_rad.copy(), errors.bias_rad.copy()
             lost[~errors.solved] = 1
+        outage, pattern = self._outage(day.hour[steps])
         return StretchDraws(
             mean_mps=plant.gusts.mean_mps,
             gust=gust.result(),
             swing=swing,
             noise=noise,
             lost=lost,
-            outage=self._outage(day.hour[steps]),
+            outage=outage,
+            pattern=pattern,
             spread=spread,
             bias=bias,
         )
 
-    def _outage(self, hour: FloatArray) -> npt.NDArray[np.uint8]:
-        """(mirror, step) which of the outages has taken the radio, from 1; 0 none."""
-        n = len(self.field)
-        out = np.zeros((n, len(hour)), np.uint8)
-        for i, outage in enumerate(self.scenario.tracking.radio.outages):
+    def _outage(self, hour: FloatArray) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
+        """Return which outage has taken the radio (pattern, step), from 1, 0 none; and each mirror's pattern."""
+        n, outages = len(self.field), self.scenario.tracking.radio.outages
+        hit = np.zeros((n, len(outages)), np.bool_)
+        for i, outage in enumerate(outages):
+            hit[:, i] = generator(self.plant.seed, 8, i).random(n) < outage.share
+        who, pattern = np.unique(hit, axis=0, return_inverse=True)
+        out = np.zeros((len(who), len(hour)), np.uint8)
+        for i, outage in enumerate(outages):
             dark = (hour >= outage.first_hour) & (hour < outage.last_hour)
-            hit = generator(self.plant.seed, 8, i).random(n) < outage.share
-            out[hit[:, None] & dark[None]] = i + 1
-        return out
+            out[who[:, i, None] & dark] = i + 1
+        return out, pattern.reshape(n)
 
     # -- by several ----------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from rfpose.checks import FloatArray
 from rfpose.errors import ScenarioError
+from rfpose.feedback.innovation import one_kick
 from rfpose.feedback.structure import StructureMode, swing_transition
 from rfpose.feedback.tracking.timeline import Day
 from rfpose.feedback.wind.gusts import gust_process
@@ -45,8 +46,11 @@ class Gusts:
         Whether the structure has a mode.
     swing_sigma_rad : (2,)
         Standard deviation of its swing by wind, right and up [rad].
-    transition, root : (2, 2)
+    transition : (2, 2)
         See `rfpose.feedback.structure.swing_transition`.
+    kick : (2,)
+        What a random number of variance one adds to its deflection and speed, so that the deflection has that
+        swing's statistics; see `rfpose.feedback.innovation.one_kick`.
 
     References
     ----------
@@ -67,12 +71,13 @@ class Gusts:
         mode = structure_of(scenario)
         self.swings = mode is not None
         self.swing_sigma_rad: FloatArray = np.zeros(2)
-        self.transition, self.root = np.zeros((2, 2)), np.zeros((2, 2))
+        self.transition, self.kick = np.zeros((2, 2)), np.zeros(2)
         if mode is not None:
             self._structure(plan, mode)
 
     def _structure(self, plan: Tracking, mode: StructureMode) -> None:
-        self.transition, self.root = swing_transition(mode, interval_s=plan.servo_interval_s)
+        self.transition, root = swing_transition(mode, interval_s=plan.servo_interval_s)
+        self.kick = one_kick(self.transition, root @ root.T, np.array([1.0, 0.0]))
         if self.mean_mps > 0.0:
             size_m = float(np.sqrt(plan.mirror_area_m2))
             resonant = wind_deflection(1.0, self.mean_mps, mode, size_m=size_m)[1]
@@ -121,8 +126,8 @@ class Gusts:
         return self._record is not None
 
     def draw_swing(self, rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-        """Return what excites the swing of mirrors (*shape, 4), of variance one; of a stiff structure nothing."""
-        return rng.standard_normal((*shape, 4) if self.swings else (*shape[:-1], 0, 4), dtype=np.float32)
+        """Return what excites the swing of mirrors (*shape, 2), of variance one; of a stiff structure nothing."""
+        return rng.standard_normal((*shape, 2) if self.swings else (*shape[:-1], 0, 2), dtype=np.float32)
 
     def swing_rad(self, rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
         """Return swings that know nothing of each other, right and up (*shape, 2) [rad]."""

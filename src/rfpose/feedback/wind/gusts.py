@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from rfpose.checks import FloatArray, as_positive
 from rfpose.errors import InvalidInputError
+from rfpose.feedback.innovation import one_kick, steady_root
 from rfpose.feedback.wind import _kernels
 from rfpose.feedback.wind.spectrum import ROUGHNESS, admittance, gust_spectrum
 
@@ -33,6 +34,11 @@ class GustProcess:
         Time constant of the part taken away: gusts have little power at the lowest frequencies [s].
     interval_s
         Between samples [s].
+    kick_mps : (process and slow part,)
+        What a random number of variance one adds to them, all with the same one; see
+        `rfpose.feedback.innovation.one_kick`.
+    start_root_mps : (process and slow part, process and slow part)
+        Root of their covariance.
     """
 
     speed_mps: float
@@ -41,6 +47,30 @@ class GustProcess:
     n_plain: int
     slow_s: float
     interval_s: float
+    kick_mps: FloatArray = field(init=False, repr=False)
+    start_root_mps: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n, keep, slow = len(self.time_s), self._keep, self._follows
+        quick = np.arange(n) >= self.n_plain
+        # what happens to the processes, and then to the slow part that follows them
+        then = np.eye(n + 1)
+        then[n] = np.append(slow * quick, 1.0 - slow)
+        transition = then @ np.diag(np.append(keep, 1.0))
+        own = np.diag(np.append(self.variance_m2ps2 * (1.0 - keep**2), 0.0))
+        kick = one_kick(transition, then @ own @ then.T, np.append(np.ones(n), -1.0))
+        object.__setattr__(self, "kick_mps", kick)
+        object.__setattr__(self, "start_root_mps", steady_root(transition, kick))
+
+    @property
+    def _keep(self) -> FloatArray:
+        """What is left of each process after a step."""
+        return np.asarray(np.exp(-self.interval_s / self.time_s))
+
+    @property
+    def _follows(self) -> float:
+        """What of its distance to the processes the slow part makes up in a step."""
+        return 1.0 - float(np.exp(-self.interval_s / self.slow_s))
 
     @property
     def sigma_mps(self) -> float:
@@ -58,17 +88,9 @@ class GustProcess:
     def start(self, rng: np.random.Generator, n_mirror: int) -> FloatArray:
         """Return a state (mirror, process and slow part) to go on from [m/s].
 
-        The processes are drawn from their steady distribution, the slow part given them.
+        It is drawn from its steady distribution.
         """
-        n = len(self.time_s)
-        state = np.empty((n_mirror, n + 1))
-        state[:, :n] = np.sqrt(self.variance_m2ps2) * rng.standard_normal((n_mirror, n))
-        # covariance of a first-order process and its low-pass: T/(T + slow) of its variance, and so the low-pass' own
-        share = self.time_s / (self.time_s + self.slow_s)
-        share[: self.n_plain] = 0.0
-        left = np.sum(self.variance_m2ps2 * share * (1.0 - share))
-        state[:, n] = state[:, :n] @ share + np.sqrt(left) * rng.standard_normal(n_mirror)
-        return state
+        return np.asarray(rng.standard_normal((n_mirror, len(self.kick_mps))) @ self.start_root_mps.T)
 
     def run(self, state: FloatArray, rng: np.random.Generator, n_step: int) -> FloatArray:
         """Return the gusts (mirror, step) [m/s] that follow a state, and take it with them in place.
@@ -76,12 +98,8 @@ class GustProcess:
         One mirror drawn in pieces is the same as at once. Several mirrors share the generator, so that pieces of
         another length give other gusts of the same kind.
         """
-        keep = np.exp(-self.interval_s / self.time_s)
-        kick = np.sqrt(self.variance_m2ps2 * (1.0 - keep**2))
-        slow = 1.0 - float(np.exp(-self.interval_s / self.slow_s))
-        noise = rng.standard_normal((len(state), n_step, len(self.time_s)))
-        out = np.empty((len(state), n_step))
-        _kernels.filter_gusts(state, keep, kick, self.n_plain, slow, noise, out)
+        out = rng.standard_normal((len(state), n_step))
+        _kernels.filter_gusts(state, self._keep, self.kick_mps, self.n_plain, self._follows, out)
         return out
 
 
