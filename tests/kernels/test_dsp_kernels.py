@@ -283,10 +283,11 @@ def test_hann_fold_is_what_weights_sample_by_sample_give(n_half):
     hop, n_tap = n_half * period, 2 * n_half * period
     samples, x = spoiled(np.random.default_rng(10), hop * (n_block + 1) + 5)
     parts, turn = turns(0.013, period, 2 * n_half)
-    weight = turn * (0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(n_tap) + 0.5) / n_tap))
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(n_tap) + 0.5) / n_tap)
+    weight, rising = turn * hann, hann[:hop].astype(np.float32)
     windows = np.array([x[k * hop : k * hop + n_tap] * weight for k in range(n_block)])
     expected = windows.reshape(n_block, 2 * n_half, period).sum(axis=1)
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_block, np.int16(2000), 16
+    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, rising, n_block, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
         for found, out in both(_kernels.fold_hann_i16, *arguments, n_seen, np.empty((n_block, 2 * period), np.float32)):
             assert found == counts

@@ -10,7 +10,10 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_fast, kernel_inline
+from rfpose.jit import kernel, kernel_fast, kernel_inline, prefetch
+
+_AHEAD_SAMPLES, _LINE_SAMPLES = 4096, 16  # from what is folded to what is asked of the memory; in a cache line
+_STRETCH_SEGMENTS = 16
 
 
 @kernel_inline
@@ -95,20 +98,50 @@ def _inspect_segment_i16(part, limit):
 
 
 @kernel
+def _zero_segments(flat, segment):
+    """Count samples of segments that are all zero: of others the first few tell."""
+    n_zero = 0
+    for first in range(0, flat.size, 2 * segment):
+        last = min(first + 2 * segment, flat.size)
+        j = first
+        while j < last and flat[j] == 0:
+            j += 1
+        if j == last:
+            n_zero += (last - first) // 2
+    return n_zero
+
+
+@kernel
 def _inspect_until_i16(flat, limit, segment, looked, end, found):
     """Inspect segments from sample ``looked`` on until ``end`` is passed; return how far that is.
 
-    ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero.
+    ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero. Stretches of segments
+    are looked at one by one only where something is clipped or filled.
     """
     n_sample = flat.size // 2
-    while looked < min(end, n_sample):
-        ahead = min(looked + segment, n_sample)
-        clipped, fill, zero = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-        found[0] += clipped
-        found[1] += fill
-        found[2] += zero
+    end = min(end, n_sample)
+    while looked < end:
+        n_segment = min((end - looked + segment - 1) // segment, _STRETCH_SEGMENTS)
+        ahead = min(looked + n_segment * segment, n_sample)
+        lowest, highest = _extremes_i16(flat[2 * looked : 2 * ahead])
+        if highest < limit and lowest > -limit:
+            found[2] += _zero_segments(flat[2 * looked : 2 * ahead], segment)
+        else:
+            for first in range(looked, ahead, segment):
+                last = min(first + segment, ahead)
+                clipped, fill, zero = _inspect_segment_i16(flat[2 * first : 2 * last], limit)
+                found[0] += clipped
+                found[1] += fill
+                found[2] += zero
         looked = ahead
     return looked
+
+
+@kernel_inline
+def _ask_ahead(pair, first, count):
+    """Ask the memory for samples that are folded later: what a processor foresees by itself ends with each page."""
+    for j in range(first + _AHEAD_SAMPLES, first + _AHEAD_SAMPLES + count, _LINE_SAMPLES):
+        prefetch(pair, j)
 
 
 @kernel_inline
@@ -158,10 +191,11 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
             out[k, j] = 0.0
         re = out[k, :period]
         im = out[k, period:]
+        looked = _inspect_until_i16(flat, limit, segment, looked, (k + 1) * n_fold * period, found)
         for r in range(0, n_fold, 2):
             first = (k * n_fold + r) * period
             end = first + 2 * period
-            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
+            _ask_ahead(pair, first, end - first)
             if r + 1 < n_fold and end <= n_sample:
                 x = pair[first : first + period]
                 after = pair[first + period : end]
@@ -179,8 +213,8 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
 
 
 @kernel_inline
-def _add_hann_row_i16(x, a, c, cosine, sine, sums):
-    """Add one row, turned by a + jc, to the plain sum and to those under a cosine and a sine."""
+def _add_hann_row_i16(x, weight, a, c, sums):
+    """Add one row, turned by a + jc, to the plain sum and to the weighted one."""
     for j in range(x.size):
         v = x[j]
         i = np.float32(np.int32(v << np.int32(16)))
@@ -189,14 +223,12 @@ def _add_hann_row_i16(x, a, c, cosine, sine, sums):
         im = i * c + q * a
         sums[0, j] += re
         sums[1, j] += im
-        sums[2, j] += cosine * re
-        sums[3, j] += cosine * im
-        sums[4, j] += sine * re
-        sums[5, j] += sine * im
+        sums[2, j] += weight[j] * re
+        sums[3, j] += weight[j] * im
 
 
 @kernel_inline
-def _add_two_hann_rows_i16(x0, x1, a0, c0, a1, c1, cosine0, sine0, cosine1, sine1, sums):
+def _add_two_hann_rows_i16(x0, x1, weight0, weight1, a0, c0, a1, c1, sums):
     """Like `_add_hann_row_i16` for two rows: the sums are loaded and stored half as often."""
     for j in range(x0.size):
         v0 = x0[j]
@@ -211,81 +243,54 @@ def _add_two_hann_rows_i16(x0, x1, a0, c0, a1, c1, cosine0, sine0, cosine1, sine
         im1 = i1 * c1 + q1 * a1
         sums[0, j] += re0 + re1
         sums[1, j] += im0 + im1
-        sums[2, j] += cosine0 * re0 + cosine1 * re1
-        sums[3, j] += cosine0 * im0 + cosine1 * im1
-        sums[4, j] += sine0 * re0 + sine1 * re1
-        sums[5, j] += sine0 * im0 + sine1 * im1
+        sums[2, j] += weight0[j] * re0 + weight1[j] * re1
+        sums[3, j] += weight0[j] * im0 + weight1[j] * im1
 
 
 @kernel_fast
-def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
+def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, rising, n_block, limit, segment, n_seen, out):
     """Fold under Hann windows that cover each sample twice, and inspect, in one pass over memory.
 
-    As `fold_flat_i16`, with ``row_re``, ``row_im`` (fold,) of a whole window and ``n_block`` windows. With
-    ``A_r + B_j`` the window's angle at sample j of row r, its cosine is ``cos A_r cos B_j − sin A_r sin B_j``: half a
-    window is added up three times, plain, under ``cos A`` and under ``sin A``; in its second half, half a turn later,
-    the same sums belong to the window before with the other sign.
+    As `fold_flat_i16`, with ``row_re``, ``row_im`` (fold,) of a whole window and ``n_block`` windows; ``rising``
+    (fold/2 · period,) is a window's first half. What a sample lacks of one under one window it has under the next, so
+    that half a window is added up twice, plain and weighted: weighted it belongs to the window that begins with it,
+    and what is left of the plain sum to the one before.
     """
     n_half = row_re.size // 2
     period = ramp_re.size
     n_sample = pair.size
-    turn_half = 2.0 * math.pi / (2 * n_half)
-    within_cos = np.empty(period, np.float32)
-    within_sin = np.empty(period, np.float32)
-    for j in range(period):
-        angle = turn_half * (j + 0.5) / period
-        within_cos[j] = 0.5 * math.cos(angle)
-        within_sin[j] = 0.5 * math.sin(angle)
-    cosine = np.empty(n_half, np.float32)
-    sine = np.empty(n_half, np.float32)
-    for r in range(n_half):
-        cosine[r] = math.cos(turn_half * r)
-        sine[r] = math.sin(turn_half * r)
     # of the second half against the first
     scale = np.float32(1.0) / (row_re[0] * row_re[0] + row_im[0] * row_im[0])
     on_re = (row_re[n_half] * row_re[0] + row_im[n_half] * row_im[0]) * scale
     on_im = (row_im[n_half] * row_re[0] - row_re[n_half] * row_im[0]) * scale
-    two = np.empty((2, 6, period), np.float32)
+    two = np.empty((2, 4, period), np.float32)
     found = np.zeros(3, np.int64)
     looked = n_seen
     for s in range(n_block + 1):
         now = two[s % 2]
         now[:] = np.float32(0.0)
+        looked = _inspect_until_i16(flat, limit, segment, looked, (s + 1) * n_half * period, found)
         for r in range(0, n_half, 2):
             first = (s * n_half + r) * period
-            end = first + 2 * period
-            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
+            _ask_ahead(pair, first, 2 * period)
             x = pair[first : first + period]
+            weight = rising[r * period : (r + 1) * period]
             if r + 1 < n_half:
+                after = pair[first + period : first + 2 * period]
+                weight_after = rising[(r + 1) * period : (r + 2) * period]
                 _add_two_hann_rows_i16(
-                    x,
-                    pair[first + period : end],
-                    row_re[r],
-                    row_im[r],
-                    row_re[r + 1],
-                    row_im[r + 1],
-                    cosine[r],
-                    sine[r],
-                    cosine[r + 1],
-                    sine[r + 1],
-                    now,
+                    x, after, weight, weight_after, row_re[r], row_im[r], row_re[r + 1], row_im[r + 1], now
                 )
             else:
-                _add_hann_row_i16(x, row_re[r], row_im[r], cosine[r], sine[r], now)
+                _add_hann_row_i16(x, weight, row_re[r], row_im[r], now)
         if s == 0:
             continue
         before = two[(s - 1) % 2]
         for j in range(period):
-            flat_re = now[0, j] * on_re - now[1, j] * on_im
-            flat_im = now[0, j] * on_im + now[1, j] * on_re
-            cos_re = now[2, j] * on_re - now[3, j] * on_im
-            cos_im = now[2, j] * on_im + now[3, j] * on_re
-            sin_re = now[4, j] * on_re - now[5, j] * on_im
-            sin_im = now[4, j] * on_im + now[5, j] * on_re
-            re = np.float32(0.5) * (before[0, j] + flat_re)
-            im = np.float32(0.5) * (before[1, j] + flat_im)
-            re += within_sin[j] * (before[4, j] - sin_re) - within_cos[j] * (before[2, j] - cos_re)
-            im += within_sin[j] * (before[5, j] - sin_im) - within_cos[j] * (before[3, j] - cos_im)
+            left_re = now[0, j] - now[2, j]
+            left_im = now[1, j] - now[3, j]
+            re = before[2, j] + left_re * on_re - left_im * on_im
+            im = before[3, j] + left_re * on_im + left_im * on_re
             out[s - 1, j] = re * ramp_re[j] - im * ramp_im[j]
             out[s - 1, period + j] = re * ramp_im[j] + im * ramp_re[j]
     _inspect_until_i16(flat, limit, segment, looked, n_sample, found)

@@ -255,7 +255,10 @@ class LineBank:
     def _one_pass(self, row: ComplexArray, ramp: ComplexArray) -> Fold:
         turns = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
         limit = np.int16(min(self.full_scale, 32767.0))
-        kernel = _kernels.fold_hann_i16 if self.window == HANN else _kernels.fold_flat_i16
+        kernel = _kernels.fold_flat_i16
+        if self.window == HANN:
+            kernel = _kernels.fold_hann_i16
+            turns.append(self._envelope[: self.hop].astype(np.float32))
 
         def fold(samples: Samples, n_seen: int, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
             pair = samples.view(np.int32).ravel()
