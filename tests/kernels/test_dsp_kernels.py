@@ -52,6 +52,16 @@ def test_inspect_counts_what_is_wrong():
         assert (clipped, bad, zero) == (3, 2, 256)
 
 
+def test_a_zero_where_samples_end_is_no_stretch_of_zeros():
+    samples = np.full((261, 2), 7, np.int16)
+    samples[-5:] = 0
+    for (_, _, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
+        assert zero == 0
+    samples[:] = 0
+    for (_, _, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
+        assert zero == 261
+
+
 def test_dirichlet_sums_phasors():
     for cycles in (0.0, 1.0, 0.25, -0.3, 1e-13, 3.0001):
         expected = np.sum(np.exp(2j * np.pi * cycles * np.arange(37)))
@@ -256,7 +266,7 @@ def turns(shift, period, n_fold):
     """Turns of rows, with the kernels' factor, and inside a row; and the same as one factor a sample."""
     row = np.exp(-2j * np.pi * shift * period * np.arange(n_fold))
     ramp = np.exp(-2j * np.pi * shift * np.arange(period))
-    parts = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
+    parts = [np.stack([z.real, z.imag]).astype(np.float32) for z in (row * 2.0**-16, ramp)]
     return parts, np.multiply.outer(row, ramp).ravel()
 
 
@@ -270,7 +280,7 @@ def test_flat_fold_turns_rows_and_inspects(n_fold, n_tail):
     n_row = n_block + (n_tail > 0)
     whole = np.concatenate([x, np.zeros(n_row * n_tap - len(x))])  # the last block may be cut short
     expected = (whole.reshape(n_row, n_tap) * turn).reshape(n_row, n_fold, period).sum(axis=1)
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_row, np.int16(2000), 16
+    arguments = samples, *parts, n_row, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
         for found, out in both(_kernels.fold_flat_i16, *arguments, n_seen, np.empty((n_row, 2 * period), np.float32)):
             assert found == counts
@@ -287,7 +297,7 @@ def test_hann_fold_is_what_weights_sample_by_sample_give(n_half):
     weight, rising = turn * hann, hann[:hop].astype(np.float32)
     windows = np.array([x[k * hop : k * hop + n_tap] * weight for k in range(n_block)])
     expected = windows.reshape(n_block, 2 * n_half, period).sum(axis=1)
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, rising, n_block, np.int16(2000), 16
+    arguments = samples, *parts, rising, n_block, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
         for found, out in both(_kernels.fold_hann_i16, *arguments, n_seen, np.empty((n_block, 2 * period), np.float32)):
             assert found == counts

@@ -1,4 +1,4 @@
-"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs travel as int32.
+"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs are taken as int32.
 
 Where sums may be reordered the inner loop is inlined, not called: a called one is compiled once on its own and once
 inside its caller, and which of the two runs would depend on whether the caller came from the cache.
@@ -86,28 +86,19 @@ def _count_i16(flat, limit):
 
 
 @kernel
-def _inspect_segment_i16(part, limit):
-    """Return (clipped, fill, samples of a stretch that is all zero) of a short stretch of I and Q."""
-    lowest, highest = _extremes_i16(part)
-    if highest >= limit or lowest <= -limit:
-        clipped, fill = _count_i16(part, limit)
-        return clipped, fill, 0
-    if lowest == 0 and highest == 0:
-        return 0, 0, part.size // 2
-    return 0, 0, 0
+def _zero_samples(flat, looked, ahead, segment):
+    """Count samples of segments that are all zero: of others the first few tell.
 
-
-@kernel
-def _zero_segments(flat, segment):
-    """Count samples of segments that are all zero: of others the first few tell."""
+    What is left at the end and shorter counts with what lies before it: a single zero means nothing.
+    """
     n_zero = 0
-    for first in range(0, flat.size, 2 * segment):
-        last = min(first + 2 * segment, flat.size)
-        j = first
-        while j < last and flat[j] == 0:
+    for first in range(looked, ahead, segment):
+        last = min(first + segment, ahead)
+        j = 2 * max(last - segment, 0)
+        while j < 2 * last and flat[j] == 0:
             j += 1
-        if j == last:
-            n_zero += (last - first) // 2
+        if j == 2 * last:
+            n_zero += last - first
     return n_zero
 
 
@@ -115,24 +106,20 @@ def _zero_segments(flat, segment):
 def _inspect_until_i16(flat, limit, segment, looked, end, found):
     """Inspect segments from sample ``looked`` on until ``end`` is passed; return how far that is.
 
-    ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero. Stretches of segments
-    are looked at one by one only where something is clipped or filled.
+    ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero.
     """
     n_sample = flat.size // 2
     end = min(end, n_sample)
     while looked < end:
         n_segment = min((end - looked + segment - 1) // segment, _STRETCH_SEGMENTS)
         ahead = min(looked + n_segment * segment, n_sample)
-        lowest, highest = _extremes_i16(flat[2 * looked : 2 * ahead])
-        if highest < limit and lowest > -limit:
-            found[2] += _zero_segments(flat[2 * looked : 2 * ahead], segment)
-        else:
-            for first in range(looked, ahead, segment):
-                last = min(first + segment, ahead)
-                clipped, fill, zero = _inspect_segment_i16(flat[2 * first : 2 * last], limit)
-                found[0] += clipped
-                found[1] += fill
-                found[2] += zero
+        stretch = flat[2 * looked : 2 * ahead]
+        lowest, highest = _extremes_i16(stretch)
+        if highest >= limit or lowest <= -limit:
+            clipped, fill = _count_i16(stretch, limit)
+            found[0] += clipped
+            found[1] += fill
+        found[2] += _zero_samples(flat, looked, ahead, segment)
         looked = ahead
     return looked
 
@@ -173,14 +160,19 @@ def _add_two_rows_i16(x0, x1, a0, c0, a1, c1, re, im):
 
 
 @kernel_fast
-def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
+def fold_flat_i16(samples, row, ramp, n_block, limit, segment, n_seen, out):
     """Fold and inspect in one pass over memory: blocks side by side, each row of a period turned as a whole.
 
-    ``flat`` (2·sample,) int16 and ``pair`` (sample,) int32 are the same samples; ``row_re``, ``row_im`` (fold,)
-    turn row by row and carry a factor 2⁻¹⁶, ``ramp_re``, ``ramp_im`` (period,) turn what is left inside a row.
-    ``out`` (block, 2·period); the last block may be cut short. Returns (clipped, fill, samples in all-zero segments) of
-    all samples but the first ``n_seen``.
+    ``samples`` (sample, 2) int16; ``row`` (2, fold) are real and imaginary part of what turns row by row and carry a
+    factor 2⁻¹⁶, ``ramp`` (2, period) of what turns what is left inside a row. ``out`` (block, 2·period); the last block
+    may be cut short. Returns (clipped, fill, samples in all-zero segments) of all samples but the first ``n_seen``.
     """
+    flat = samples.reshape(samples.size)
+    pair = flat.view(np.int32)
+    row_re = row[0]
+    row_im = row[1]
+    ramp_re = ramp[0]
+    ramp_im = ramp[1]
     n_fold = row_re.size
     period = ramp_re.size
     n_sample = pair.size
@@ -248,14 +240,20 @@ def _add_two_hann_rows_i16(x0, x1, weight0, weight1, a0, c0, a1, c1, sums):
 
 
 @kernel_fast
-def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, rising, n_block, limit, segment, n_seen, out):
+def fold_hann_i16(samples, row, ramp, rising, n_block, limit, segment, n_seen, out):
     """Fold under Hann windows that cover each sample twice, and inspect, in one pass over memory.
 
-    As `fold_flat_i16`, with ``row_re``, ``row_im`` (fold,) of a whole window and ``n_block`` windows; ``rising``
-    (fold/2 · period,) is a window's first half. What a sample lacks of one under one window it has under the next, so
-    that half a window is added up twice, plain and weighted: weighted it belongs to the window that begins with it,
-    and what is left of the plain sum to the one before.
+    As `fold_flat_i16`, with ``row`` (2, fold) of a whole window and ``n_block`` windows; ``rising`` (fold/2 · period,)
+    is a window's first half. What a sample lacks of one under one window it has under the next, so that half a window
+    is added up twice, plain and weighted: weighted it belongs to the window that begins with it, and what is left of
+    the plain sum to the one before.
     """
+    flat = samples.reshape(samples.size)
+    pair = flat.view(np.int32)
+    row_re = row[0]
+    row_im = row[1]
+    ramp_re = ramp[0]
+    ramp_im = ramp[1]
     n_half = row_re.size // 2
     period = ramp_re.size
     n_sample = pair.size
