@@ -5,6 +5,9 @@ import pytest
 
 from rfpose.dsp import _kernels
 
+ANYWHERE = np.zeros(1, np.int64)
+"""Where folded blocks are put that are not told apart by classes."""
+
 
 def both(kernel, *args):
     """Run the compiled kernel and its Python twin on copies; return both results with their output arrays."""
@@ -29,12 +32,32 @@ def test_fold_is_weight_and_add(hop, n_fold):
     for k in range(n_block):
         block = (x[k * hop : k * hop + n_tap] * (w_re + 1j * w_im)).reshape(n_fold, period).sum(axis=0)
         expected[k] = np.concatenate([block.real, block.imag])
-    out = np.zeros((n_block, 2 * period), np.float32)
-    integer = both(_kernels.fold_i16, samples.view(np.int32).ravel(), w_re, w_im, hop, n_fold, period, n_block, out)
+    out, arguments = (
+        np.zeros((1, n_block, 2 * period), np.float32),
+        (w_re, w_im, hop, n_fold, period, ANYWHERE, n_block),
+    )
+    integer = both(_kernels.fold_i16, samples.view(np.int32).ravel(), *arguments, out)
     as_float = samples.astype(np.float32).view(np.complex64).ravel()
-    floating = both(_kernels.fold_c64, as_float, w_re, w_im, hop, n_fold, period, n_block, out)
+    floating = both(_kernels.fold_c64, as_float, *arguments, out)
     for _, found in (*integer, *floating):
-        np.testing.assert_allclose(found, expected, atol=0.05)
+        np.testing.assert_allclose(found[0], expected, atol=0.05)
+
+
+@pytest.mark.parametrize("place", [(0, 1, 2, 3), (3, 0, 1, 2)])
+def test_lines_of_a_class_are_found_in_a_quarter_of_a_folded_block(place):
+    period, n_block = 24, 2
+    rng = np.random.default_rng(13)
+    samples = (rng.standard_normal((period * n_block, 2))).astype(np.float32)
+    n = np.arange(period)
+    line = np.exp(-2j * np.pi * np.outer(n, n) / period)  # each number of cycles a period
+    expected = samples.view(np.complex64).reshape(n_block, period) @ line
+    ones, zeros = np.ones(period, np.float32), np.zeros(period, np.float32)
+    arguments = samples.view(np.complex64).ravel(), ones, zeros, period, 1, period, np.array(place), n_block
+    for _, found in both(_kernels.fold_c64, *arguments, np.empty((4, n_block, period // 2), np.float32)):
+        quarter = found[..., : period // 4] + 1j * found[..., period // 4 :]
+        for cycles in n:
+            by_class = quarter[place[cycles % 4]] @ line[: period // 4, cycles]
+            np.testing.assert_allclose(by_class, expected[:, cycles], atol=1e-5)
 
 
 def test_inspect_counts_what_is_wrong():
@@ -81,18 +104,19 @@ def test_cosine_sum_response_is_the_windows_spectrum():
 
 def test_turn_back_takes_each_lines_own_frequency_off():
     rng = np.random.default_rng(3)
-    block = rng.standard_normal((9, 4)).astype(np.float32)
-    cycles = np.array([0.3, -1.7])
-    plain = (block[:, :2] + 1j * block[:, 2:]).T
+    block = rng.standard_normal((2, 9, 4)).astype(np.float32)
+    cycles = np.array([0.3, -1.7, 0.2])
+    place = np.array([[0, 1], [1, 0], [1, 1]])
+    plain = np.array([block[c, :, i] + 1j * block[c, :, 2 + i] for c, i in place])
     expected = plain * np.exp(-2j * np.pi * np.outer(cycles, np.arange(9)))
     for kernel in (_kernels.turn_back, _kernels.turn_back.py_func):
-        out, tail = np.empty((2, 9), np.complex128), np.empty(2, np.complex128)
-        kernel(block, cycles, out, tail)
+        out, tail = np.empty((3, 9), np.complex128), np.empty(3, np.complex128)
+        kernel(block, place, cycles, out, tail)
         np.testing.assert_allclose(out, expected, atol=1e-12)
         np.testing.assert_array_equal(tail, 0.0)
         # one block more than there is room for is the tail
-        out = np.empty((2, 8), np.complex128)
-        kernel(block, cycles, out, tail)
+        out = np.empty((3, 8), np.complex128)
+        kernel(block, place, cycles, out, tail)
         np.testing.assert_allclose(np.column_stack([out, tail]), expected, atol=1e-12)
 
 
@@ -280,11 +304,13 @@ def test_flat_fold_turns_rows_and_inspects(n_fold, n_tail):
     n_row = n_block + (n_tail > 0)
     whole = np.concatenate([x, np.zeros(n_row * n_tap - len(x))])  # the last block may be cut short
     expected = (whole.reshape(n_row, n_tap) * turn).reshape(n_row, n_fold, period).sum(axis=1)
-    arguments = samples, *parts, n_row, np.int16(2000), 16
+    arguments = samples, *parts, ANYWHERE, n_row, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
-        for found, out in both(_kernels.fold_flat_i16, *arguments, n_seen, np.empty((n_row, 2 * period), np.float32)):
+        for found, out in both(
+            _kernels.fold_flat_i16, *arguments, n_seen, np.empty((1, n_row, 2 * period), np.float32)
+        ):
             assert found == counts
-            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+            np.testing.assert_allclose(out[0], np.hstack([expected.real, expected.imag]), atol=0.01)
 
 
 @pytest.mark.parametrize("n_half", [2, 3])
@@ -297,11 +323,13 @@ def test_hann_fold_is_what_weights_sample_by_sample_give(n_half):
     weight, rising = turn * hann, hann[:hop].astype(np.float32)
     windows = np.array([x[k * hop : k * hop + n_tap] * weight for k in range(n_block)])
     expected = windows.reshape(n_block, 2 * n_half, period).sum(axis=1)
-    arguments = samples, *parts, rising, n_block, np.int16(2000), 16
+    arguments = samples, *parts, rising, ANYWHERE, n_block, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
-        for found, out in both(_kernels.fold_hann_i16, *arguments, n_seen, np.empty((n_block, 2 * period), np.float32)):
+        for found, out in both(
+            _kernels.fold_hann_i16, *arguments, n_seen, np.empty((1, n_block, 2 * period), np.float32)
+        ):
             assert found == counts
-            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+            np.testing.assert_allclose(out[0], np.hstack([expected.real, expected.imag]), atol=0.01)
 
 
 def test_smooth_variance_of_equal_lines_is_their_mean():

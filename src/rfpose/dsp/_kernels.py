@@ -17,12 +17,11 @@ _STRETCH_SEGMENTS = 16
 
 
 @kernel_inline
-def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
-    """Weight one block, add its n_fold stretches of ``period`` samples: out = [re(period), im(period)]."""
-    for j in range(2 * period):
-        out[j] = 0.0
-    re = out[:period]
-    im = out[period:]
+def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, re, im):
+    """Weight one block, add its n_fold stretches of ``period`` samples to ``re`` and ``im``."""
+    for j in range(period):
+        re[j] = 0.0
+        im[j] = 0.0
     for r in range(n_fold):
         base = r * period
         x = pair[base : base + period]
@@ -38,12 +37,11 @@ def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
 
 
 @kernel_inline
-def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
+def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, re, im):
     """Like `_fold_block_i16` for complex64 samples."""
-    for j in range(2 * period):
-        out[j] = 0.0
-    re = out[:period]
-    im = out[period:]
+    for j in range(period):
+        re[j] = 0.0
+        im[j] = 0.0
     for r in range(n_fold):
         base = r * period
         x = sample[base : base + period]
@@ -159,13 +157,60 @@ def _add_two_rows_i16(x0, x1, a0, c0, a1, c1, re, im):
         im[j] += (i0 * c0 + q0 * a0) + (i1 * c1 + q1 * a1)
 
 
+@kernel_inline
+def _turn_inside(re, im, ramp_re, ramp_im):
+    for j in range(re.size):
+        turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
+        im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
+        re[j] = turned
+
+
+@kernel_inline
+def _put_sum_and_difference(first, after, sums, differences):
+    for j in range(first.size):
+        sums[j] = first[j] + after[j]
+        differences[j] = first[j] - after[j]
+
+
+@kernel_inline
+def _put(re, im, place, k, out):
+    """Bring a folded block (period,) into row k of ``out`` (class, block, 2·period/class); spoils ``re`` and ``im``.
+
+    Of four classes a line of c + 4i cycles in a period is in the c-th, which is put where ``place`` (4,) says: a line's
+    product with the quarters of a period differs from its product with the first by factors (−j)^c, so that they are
+    added up once for all lines of a class.
+    """
+    if out.shape[0] == 1:
+        for j in range(re.size):
+            out[0, k, j] = re[j]
+            out[0, k, re.size + j] = im[j]
+        return
+    n = re.size // 4
+    half = 2 * n
+    for part in (re, im):
+        for j in range(half):
+            first = part[j]
+            after = part[half + j]
+            part[j] = first + after
+            part[half + j] = first - after
+    even = out[place[0], k]
+    other = out[place[2], k]
+    _put_sum_and_difference(re[:n], re[n:half], even[:n], other[:n])
+    _put_sum_and_difference(im[:n], im[n:half], even[n:], other[n:])
+    back = out[place[1], k]
+    on = out[place[3], k]
+    _put_sum_and_difference(re[half : half + n], im[half + n :], back[:n], on[:n])
+    _put_sum_and_difference(im[half : half + n], re[half + n :], on[n:], back[n:])
+
+
 @kernel_fast
-def fold_flat_i16(samples, row, ramp, n_block, limit, segment, n_seen, out):
+def fold_flat_i16(samples, row, ramp, place, n_block, limit, segment, n_seen, out):
     """Fold and inspect in one pass over memory: blocks side by side, each row of a period turned as a whole.
 
     ``samples`` (sample, 2) int16; ``row`` (2, fold) are real and imaginary part of what turns row by row and carry a
-    factor 2⁻¹⁶, ``ramp`` (2, period) of what turns what is left inside a row. ``out`` (block, 2·period); the last block
-    may be cut short. Returns (clipped, fill, samples in all-zero segments) of all samples but the first ``n_seen``.
+    factor 2⁻¹⁶, ``ramp`` (2, period) of what turns what is left inside a row; ``place`` and ``out`` as `_put`. The last
+    block may be cut short. Returns (clipped, fill, samples in all-zero segments) of all samples but the first
+    ``n_seen``.
     """
     flat = samples.reshape(samples.size)
     pair = flat.view(np.int32)
@@ -178,11 +223,11 @@ def fold_flat_i16(samples, row, ramp, n_block, limit, segment, n_seen, out):
     n_sample = pair.size
     found = np.zeros(3, np.int64)
     looked = n_seen
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        for j in range(2 * period):
-            out[k, j] = 0.0
-        re = out[k, :period]
-        im = out[k, period:]
+        re[:] = np.float32(0.0)
+        im[:] = np.float32(0.0)
         looked = _inspect_until_i16(flat, limit, segment, looked, (k + 1) * n_fold * period, found)
         for r in range(0, n_fold, 2):
             first = (k * n_fold + r) * period
@@ -196,10 +241,8 @@ def fold_flat_i16(samples, row, ramp, n_block, limit, segment, n_seen, out):
             for one in range(r, min(r + 2, n_fold)):
                 first = min((k * n_fold + one) * period, n_sample)
                 _add_row_i16(pair[first : min(first + period, n_sample)], row_re[one], row_im[one], re, im)
-        for j in range(period):
-            turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
-            im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
-            re[j] = turned
+        _turn_inside(re, im, ramp_re, ramp_im)
+        _put(re, im, place, k, out)
     _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
     return found[0], found[1], found[2]
 
@@ -240,7 +283,7 @@ def _add_two_hann_rows_i16(x0, x1, weight0, weight1, a0, c0, a1, c1, sums):
 
 
 @kernel_fast
-def fold_hann_i16(samples, row, ramp, rising, n_block, limit, segment, n_seen, out):
+def fold_hann_i16(samples, row, ramp, rising, place, n_block, limit, segment, n_seen, out):
     """Fold under Hann windows that cover each sample twice, and inspect, in one pass over memory.
 
     As `fold_flat_i16`, with ``row`` (2, fold) of a whole window and ``n_block`` windows; ``rising`` (fold/2 · period,)
@@ -262,6 +305,8 @@ def fold_hann_i16(samples, row, ramp, rising, n_block, limit, segment, n_seen, o
     on_re = (row_re[n_half] * row_re[0] + row_im[n_half] * row_im[0]) * scale
     on_im = (row_im[n_half] * row_re[0] - row_re[n_half] * row_im[0]) * scale
     two = np.empty((2, 4, period), np.float32)
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     found = np.zeros(3, np.int64)
     looked = n_seen
     for s in range(n_block + 1):
@@ -287,28 +332,34 @@ def fold_hann_i16(samples, row, ramp, rising, n_block, limit, segment, n_seen, o
         for j in range(period):
             left_re = now[0, j] - now[2, j]
             left_im = now[1, j] - now[3, j]
-            re = before[2, j] + left_re * on_re - left_im * on_im
-            im = before[3, j] + left_re * on_im + left_im * on_re
-            out[s - 1, j] = re * ramp_re[j] - im * ramp_im[j]
-            out[s - 1, period + j] = re * ramp_im[j] + im * ramp_re[j]
+            re[j] = before[2, j] + left_re * on_re - left_im * on_im
+            im[j] = before[3, j] + left_re * on_im + left_im * on_re
+        _turn_inside(re, im, ramp_re, ramp_im)
+        _put(re, im, place, s - 1, out)
     _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
     return found[0], found[1], found[2]
 
 
 @kernel_fast
-def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
-    """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
+def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, place, n_block, out):
+    """Fold blocks that start every ``hop`` samples: ``pair`` (sample,) int32; ``place`` and ``out`` as `_put`."""
     n_tap = n_fold * period
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, re, im)
+        _put(re, im, place, k, out)
 
 
 @kernel_fast
-def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
+def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, place, n_block, out):
     """Like `fold_i16` for (sample,) complex64."""
     n_tap = n_fold * period
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, re, im)
+        _put(re, im, place, k, out)
 
 
 @kernel
@@ -446,20 +497,24 @@ def _phasors(cycles_hop, n_block, out):
 
 
 @kernel
-def turn_back(block, cycles_hop, out, tail):
-    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128.
+def turn_back(block, place, cycles_hop, out, tail):
+    """Turn lines back by their own frequencies: ``out`` (line, block) complex128.
 
-    One block more than ``out`` takes is the frame's tail, and goes to ``tail`` (line,).
+    ``block`` (class, block, 2·column) float32 holds real and then imaginary parts, ``place`` (line, 2) the class and
+    column of each line. One block more than ``out`` takes is the frame's tail, and goes to ``tail`` (line,).
     """
     n_line, n_block = out.shape
+    n_column = block.shape[2] // 2
     phasor = np.empty(n_block + 1, np.complex128)
     for m in range(n_line):
         _phasors(-cycles_hop[m], n_block + 1, phasor)
+        own = block[place[m, 0]]
+        i = place[m, 1]
         for k in range(n_block):
-            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor[k]
+            out[m, k] = complex(own[k, i], own[k, n_column + i]) * phasor[k]
         tail[m] = 0.0
-        if block.shape[0] > n_block:
-            tail[m] = complex(block[n_block, m], block[n_block, n_line + m]) * phasor[n_block]
+        if own.shape[0] > n_block:
+            tail[m] = complex(own[n_block, i], own[n_block, n_column + i]) * phasor[n_block]
 
 
 @kernel
