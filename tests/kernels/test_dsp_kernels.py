@@ -336,3 +336,35 @@ def test_smooth_variance_of_equal_lines_is_their_mean():
     variance = np.array([1.0, 1.01, 0.99, 1.0])
     for _, out in both(_kernels.smooth_variance, variance, 60.0, np.empty(4)):
         np.testing.assert_allclose(out, variance.mean())
+
+
+@pytest.mark.parametrize("n_group", [1, 2])
+def test_a_fit_is_its_steps_one_after_the_other(n_group):
+    rng = np.random.default_rng(14)
+    n_line, n_block, hop, n_tail, centre = 3, 7, 16, 5, 58.0
+    n_part, span = n_block // n_group, hop * n_group
+    cycles = np.array([0.1, 0.17, -0.23])
+    turned, template, slope = cycles + 1e-5, cycles - 2e-4, np.array([1e-3, 2e-3, -1e-3])
+
+    def drawn(*shape):
+        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+    stream, tail = drawn(n_line, n_block), drawn(n_line)
+    below, above, part = drawn(2, n_line, n_line), drawn(2, n_line, n_line), 0.3
+    sums, grouped = np.empty(n_line, np.complex128), np.empty((n_line, n_part), np.complex128)
+    _kernels.group_lines(stream, tail, (turned - cycles) * hop, n_group, sums, grouped)
+    amplitude, gain, variance = np.empty(n_line, np.complex128), np.empty(n_line), np.empty(n_line)
+    group, model = np.empty((n_line, n_line), np.complex128), np.empty_like(grouped)
+    sizes = hop, n_block, n_tail, n_group, centre
+    _kernels.model_of_lines(sums, below, above, part, cycles, cycles - template, *sizes, amplitude, gain, group, model)
+    first_middle = 0.5 * span - 0.5 - centre
+    expected = _kernels.noise_of_lines(
+        grouped, group @ model, cycles * span, model[:, 0].copy(), slope, first_middle, span, gain, variance
+    )
+    for kernel in (_kernels.fit_lines, _kernels.fit_lines.py_func):
+        found, own = np.empty(n_line, np.complex128), np.empty(n_line)
+        clock = turned, cycles, template, below, above, part, slope
+        step = kernel(stream, tail, *clock, hop, n_tail, n_group, centre, found, own)
+        np.testing.assert_allclose(step, expected, rtol=1e-9)
+        np.testing.assert_allclose(found, amplitude, rtol=1e-12)
+        np.testing.assert_allclose(own, variance, rtol=1e-9)

@@ -652,6 +652,64 @@ def noise_of_lines(stream, model, cycles_span, first, slope, first_middle, span,
 
 
 @kernel
+def _product(a, b, out):
+    """Product of (row, inner) and (inner, column) complex128; numba's own would load scipy."""
+    for i in range(a.shape[0]):
+        row = out[i]
+        row[:] = 0.0
+        for k in range(a.shape[1]):
+            factor = a[i, k]
+            other = b[k]
+            for j in range(row.size):
+                row[j] += factor * other[j]
+
+
+@kernel
+def fit_lines(
+    stream,
+    tail,
+    turned_cycles,
+    cycles,
+    template_cycles,
+    below,
+    above,
+    part,
+    slope,
+    hop,
+    n_tail,
+    n_group,
+    centre,
+    amplitude,
+    variance,
+):
+    """Fit all lines of a frame: `group_lines`, `model_of_lines` and `noise_of_lines` one after the other.
+
+    One call, since each lets go of the interpreter, and threads would wait for it anew. ``turned_cycles`` (line,) were
+    the lines' frequencies when ``stream`` was turned back, ``cycles`` are; ``template_cycles`` those of the templates,
+    with the band's shift. Gives ``amplitude`` and ``variance`` (line,); returns the clock's step and its sigma.
+    """
+    n_line, n_block = stream.shape
+    n_part = n_block // n_group
+    span = hop * n_group
+    sums = np.empty(n_line, np.complex128)
+    gain = np.empty(n_line)
+    grouped = np.empty((n_line, n_part), np.complex128)
+    model = np.empty((n_line, n_part), np.complex128)
+    leaked = np.empty((n_line, n_part), np.complex128)
+    group = np.empty((n_line, n_line), np.complex128)
+    group_lines(stream, tail, (turned_cycles - cycles) * hop, n_group, sums, grouped)
+    inside = cycles - template_cycles
+    model_of_lines(
+        sums, below, above, part, cycles, inside, hop, n_block, n_tail, n_group, centre, amplitude, gain, group, model
+    )
+    # Groups keep the work small in long frames; they are alike, so that a few blocks at the end may be left out.
+    _product(group, model, leaked)
+    first = model[:, 0].copy()
+    first_middle = 0.5 * span - 0.5 - centre
+    return noise_of_lines(grouped, leaked, cycles * span, first, slope, first_middle, span, gain, variance)
+
+
+@kernel
 def filtered_lines(stream, cycles_hop, to_centre, line, amplitude, scatter):
     """Turn (line, block) on by ``cycles_hop`` a block and refer it to the frame's centre: ``line``.
 
