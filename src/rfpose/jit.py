@@ -35,6 +35,7 @@ __all__ = [
     "load_numba",
     "one_thread",
     "prange",
+    "prefetch",
 ]
 
 Function = Callable[..., Any]
@@ -86,6 +87,10 @@ def kernel_fast(function: Function) -> Kernel:
 
 prange = range
 """In a kernel: a loop that runs on all cores; numba's own takes this name's place before anything is compiled."""
+
+
+def prefetch(array: Any, index: int) -> None:
+    """In a kernel: ask the memory for an item, maybe beyond the array's end, so that it is there when it is needed."""
 
 
 class Kernel:
@@ -206,7 +211,26 @@ def load_numba() -> Any:
     # OpenMP's pool may be entered from several Python threads; numba's own work queue may not.
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # type: ignore[attr-defined]
     event.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
+    _teach_prefetch(numba)
     return numba
+
+
+def _teach_prefetch(numba: Any) -> None:
+    """Tell numba what `prefetch` is in compiled code: one instruction, which numba has no name for."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        ir = importlib.import_module("llvmlite.ir")
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        place = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        to_read, kept_close, of_data = number(0), number(3), number(1)
+        told = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
+        function = numba.core.cgutils.get_or_insert_function(builder.module, told, "llvm.prefetch.p0")
+        builder.call(function, [place, to_read, kept_close, of_data])
+        return context.get_dummy_value()
+
+    ask = numba.extending.intrinsic(lambda _, array, index: (numba.types.void(array, index), generate))
+    numba.extending.overload(prefetch)(lambda array, index: lambda array, index: ask(array, index))
 
 
 @functools.cache

@@ -5,6 +5,9 @@ import pytest
 
 from rfpose.dsp import _kernels
 
+ANYWHERE = np.zeros(1, np.int64)
+"""Where folded blocks are put that are not told apart by classes."""
+
 
 def both(kernel, *args):
     """Run the compiled kernel and its Python twin on copies; return both results with their output arrays."""
@@ -29,12 +32,32 @@ def test_fold_is_weight_and_add(hop, n_fold):
     for k in range(n_block):
         block = (x[k * hop : k * hop + n_tap] * (w_re + 1j * w_im)).reshape(n_fold, period).sum(axis=0)
         expected[k] = np.concatenate([block.real, block.imag])
-    out = np.zeros((n_block, 2 * period), np.float32)
-    integer = both(_kernels.fold_i16, samples.view(np.int32).ravel(), w_re, w_im, hop, n_fold, period, n_block, out)
+    out, arguments = (
+        np.zeros((1, n_block, 2 * period), np.float32),
+        (w_re, w_im, hop, n_fold, period, ANYWHERE, n_block),
+    )
+    integer = both(_kernels.fold_i16, samples.view(np.int32).ravel(), *arguments, out)
     as_float = samples.astype(np.float32).view(np.complex64).ravel()
-    floating = both(_kernels.fold_c64, as_float, w_re, w_im, hop, n_fold, period, n_block, out)
+    floating = both(_kernels.fold_c64, as_float, *arguments, out)
     for _, found in (*integer, *floating):
-        np.testing.assert_allclose(found, expected, atol=0.05)
+        np.testing.assert_allclose(found[0], expected, atol=0.05)
+
+
+@pytest.mark.parametrize("place", [(0, 1, 2, 3), (3, 0, 1, 2)])
+def test_lines_of_a_class_are_found_in_a_quarter_of_a_folded_block(place):
+    period, n_block = 24, 2
+    rng = np.random.default_rng(13)
+    samples = (rng.standard_normal((period * n_block, 2))).astype(np.float32)
+    n = np.arange(period)
+    line = np.exp(-2j * np.pi * np.outer(n, n) / period)  # each number of cycles a period
+    expected = samples.view(np.complex64).reshape(n_block, period) @ line
+    ones, zeros = np.ones(period, np.float32), np.zeros(period, np.float32)
+    arguments = samples.view(np.complex64).ravel(), ones, zeros, period, 1, period, np.array(place), n_block
+    for _, found in both(_kernels.fold_c64, *arguments, np.empty((4, n_block, period // 2), np.float32)):
+        quarter = found[..., : period // 4] + 1j * found[..., period // 4 :]
+        for cycles in n:
+            by_class = quarter[place[cycles % 4]] @ line[: period // 4, cycles]
+            np.testing.assert_allclose(by_class, expected[:, cycles], atol=1e-5)
 
 
 def test_inspect_counts_what_is_wrong():
@@ -50,6 +73,16 @@ def test_inspect_counts_what_is_wrong():
     floats[9, 0] = -np.inf
     for (clipped, bad, zero), _ in both(_kernels.inspect_f32, floats.ravel(), 2000.0, 256):
         assert (clipped, bad, zero) == (3, 2, 256)
+
+
+def test_a_zero_where_samples_end_is_no_stretch_of_zeros():
+    samples = np.full((261, 2), 7, np.int16)
+    samples[-5:] = 0
+    for (_, _, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
+        assert zero == 0
+    samples[:] = 0
+    for (_, _, zero), _ in both(_kernels.inspect_i16, samples.ravel(), np.int16(2000), 256):
+        assert zero == 261
 
 
 def test_dirichlet_sums_phasors():
@@ -71,18 +104,19 @@ def test_cosine_sum_response_is_the_windows_spectrum():
 
 def test_turn_back_takes_each_lines_own_frequency_off():
     rng = np.random.default_rng(3)
-    block = rng.standard_normal((9, 4)).astype(np.float32)
-    cycles = np.array([0.3, -1.7])
-    plain = (block[:, :2] + 1j * block[:, 2:]).T
+    block = rng.standard_normal((2, 9, 4)).astype(np.float32)
+    cycles = np.array([0.3, -1.7, 0.2])
+    place = np.array([[0, 1], [1, 0], [1, 1]])
+    plain = np.array([block[c, :, i] + 1j * block[c, :, 2 + i] for c, i in place])
     expected = plain * np.exp(-2j * np.pi * np.outer(cycles, np.arange(9)))
     for kernel in (_kernels.turn_back, _kernels.turn_back.py_func):
-        out, tail = np.empty((2, 9), np.complex128), np.empty(2, np.complex128)
-        kernel(block, cycles, out, tail)
+        out, tail = np.empty((3, 9), np.complex128), np.empty(3, np.complex128)
+        kernel(block, place, cycles, out, tail)
         np.testing.assert_allclose(out, expected, atol=1e-12)
         np.testing.assert_array_equal(tail, 0.0)
         # one block more than there is room for is the tail
-        out = np.empty((2, 8), np.complex128)
-        kernel(block, cycles, out, tail)
+        out = np.empty((3, 8), np.complex128)
+        kernel(block, place, cycles, out, tail)
         np.testing.assert_allclose(np.column_stack([out, tail]), expected, atol=1e-12)
 
 
@@ -256,7 +290,7 @@ def turns(shift, period, n_fold):
     """Turns of rows, with the kernels' factor, and inside a row; and the same as one factor a sample."""
     row = np.exp(-2j * np.pi * shift * period * np.arange(n_fold))
     ramp = np.exp(-2j * np.pi * shift * np.arange(period))
-    parts = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
+    parts = [np.stack([z.real, z.imag]).astype(np.float32) for z in (row * 2.0**-16, ramp)]
     return parts, np.multiply.outer(row, ramp).ravel()
 
 
@@ -270,11 +304,13 @@ def test_flat_fold_turns_rows_and_inspects(n_fold, n_tail):
     n_row = n_block + (n_tail > 0)
     whole = np.concatenate([x, np.zeros(n_row * n_tap - len(x))])  # the last block may be cut short
     expected = (whole.reshape(n_row, n_tap) * turn).reshape(n_row, n_fold, period).sum(axis=1)
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_row, np.int16(2000), 16
+    arguments = samples, *parts, ANYWHERE, n_row, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
-        for found, out in both(_kernels.fold_flat_i16, *arguments, n_seen, np.empty((n_row, 2 * period), np.float32)):
+        for found, out in both(
+            _kernels.fold_flat_i16, *arguments, n_seen, np.empty((1, n_row, 2 * period), np.float32)
+        ):
             assert found == counts
-            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+            np.testing.assert_allclose(out[0], np.hstack([expected.real, expected.imag]), atol=0.01)
 
 
 @pytest.mark.parametrize("n_half", [2, 3])
@@ -283,17 +319,52 @@ def test_hann_fold_is_what_weights_sample_by_sample_give(n_half):
     hop, n_tap = n_half * period, 2 * n_half * period
     samples, x = spoiled(np.random.default_rng(10), hop * (n_block + 1) + 5)
     parts, turn = turns(0.013, period, 2 * n_half)
-    weight = turn * (0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(n_tap) + 0.5) / n_tap))
+    hann = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(n_tap) + 0.5) / n_tap)
+    weight, rising = turn * hann, hann[:hop].astype(np.float32)
     windows = np.array([x[k * hop : k * hop + n_tap] * weight for k in range(n_block)])
     expected = windows.reshape(n_block, 2 * n_half, period).sum(axis=1)
-    arguments = samples.reshape(-1), samples.view(np.int32).ravel(), *parts, n_block, np.int16(2000), 16
+    arguments = samples, *parts, rising, ANYWHERE, n_block, np.int16(2000), 16
     for n_seen, counts in ((0, (2, 1, 16)), (64, (1, 0, 16))):
-        for found, out in both(_kernels.fold_hann_i16, *arguments, n_seen, np.empty((n_block, 2 * period), np.float32)):
+        for found, out in both(
+            _kernels.fold_hann_i16, *arguments, n_seen, np.empty((1, n_block, 2 * period), np.float32)
+        ):
             assert found == counts
-            np.testing.assert_allclose(out, np.hstack([expected.real, expected.imag]), atol=0.01)
+            np.testing.assert_allclose(out[0], np.hstack([expected.real, expected.imag]), atol=0.01)
 
 
 def test_smooth_variance_of_equal_lines_is_their_mean():
     variance = np.array([1.0, 1.01, 0.99, 1.0])
     for _, out in both(_kernels.smooth_variance, variance, 60.0, np.empty(4)):
         np.testing.assert_allclose(out, variance.mean())
+
+
+@pytest.mark.parametrize("n_group", [1, 2])
+def test_a_fit_is_its_steps_one_after_the_other(n_group):
+    rng = np.random.default_rng(14)
+    n_line, n_block, hop, n_tail, centre = 3, 7, 16, 5, 58.0
+    n_part, span = n_block // n_group, hop * n_group
+    cycles = np.array([0.1, 0.17, -0.23])
+    turned, template, slope = cycles + 1e-5, cycles - 2e-4, np.array([1e-3, 2e-3, -1e-3])
+
+    def drawn(*shape):
+        return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+
+    stream, tail = drawn(n_line, n_block), drawn(n_line)
+    below, above, part = drawn(2, n_line, n_line), drawn(2, n_line, n_line), 0.3
+    sums, grouped = np.empty(n_line, np.complex128), np.empty((n_line, n_part), np.complex128)
+    _kernels.group_lines(stream, tail, (turned - cycles) * hop, n_group, sums, grouped)
+    amplitude, gain, variance = np.empty(n_line, np.complex128), np.empty(n_line), np.empty(n_line)
+    group, model = np.empty((n_line, n_line), np.complex128), np.empty_like(grouped)
+    sizes = hop, n_block, n_tail, n_group, centre
+    _kernels.model_of_lines(sums, below, above, part, cycles, cycles - template, *sizes, amplitude, gain, group, model)
+    first_middle = 0.5 * span - 0.5 - centre
+    expected = _kernels.noise_of_lines(
+        grouped, group @ model, cycles * span, model[:, 0].copy(), slope, first_middle, span, gain, variance
+    )
+    for kernel in (_kernels.fit_lines, _kernels.fit_lines.py_func):
+        found, own = np.empty(n_line, np.complex128), np.empty(n_line)
+        clock = turned, cycles, template, below, above, part, slope
+        step = kernel(stream, tail, *clock, hop, n_tail, n_group, centre, found, own)
+        np.testing.assert_allclose(step, expected, rtol=1e-9)
+        np.testing.assert_allclose(found, amplitude, rtol=1e-12)
+        np.testing.assert_allclose(own, variance, rtol=1e-9)

@@ -1,4 +1,4 @@
-"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs travel as int32.
+"""Inner loops of the line bank. Samples come as (sample, 2) int16 or float32; int16 pairs are taken as int32.
 
 Where sums may be reordered the inner loop is inlined, not called: a called one is compiled once on its own and once
 inside its caller, and which of the two runs would depend on whether the caller came from the cache.
@@ -10,16 +10,18 @@ import math
 
 import numpy as np
 
-from rfpose.jit import kernel, kernel_fast, kernel_inline
+from rfpose.jit import kernel, kernel_fast, kernel_inline, prefetch
+
+_AHEAD_SAMPLES, _LINE_SAMPLES = 4096, 16  # from what is folded to what is asked of the memory; in a cache line
+_STRETCH_SEGMENTS = 16
 
 
 @kernel_inline
-def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
-    """Weight one block, add its n_fold stretches of ``period`` samples: out = [re(period), im(period)]."""
-    for j in range(2 * period):
-        out[j] = 0.0
-    re = out[:period]
-    im = out[period:]
+def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, re, im):
+    """Weight one block, add its n_fold stretches of ``period`` samples to ``re`` and ``im``."""
+    for j in range(period):
+        re[j] = 0.0
+        im[j] = 0.0
     for r in range(n_fold):
         base = r * period
         x = pair[base : base + period]
@@ -35,12 +37,11 @@ def _fold_block_i16(pair, weight_re, weight_im, n_fold, period, out):
 
 
 @kernel_inline
-def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, out):
+def _fold_block_c64(sample, weight_re, weight_im, n_fold, period, re, im):
     """Like `_fold_block_i16` for complex64 samples."""
-    for j in range(2 * period):
-        out[j] = 0.0
-    re = out[:period]
-    im = out[period:]
+    for j in range(period):
+        re[j] = 0.0
+        im[j] = 0.0
     for r in range(n_fold):
         base = r * period
         x = sample[base : base + period]
@@ -83,15 +84,20 @@ def _count_i16(flat, limit):
 
 
 @kernel
-def _inspect_segment_i16(part, limit):
-    """Return (clipped, fill, samples of a stretch that is all zero) of a short stretch of I and Q."""
-    lowest, highest = _extremes_i16(part)
-    if highest >= limit or lowest <= -limit:
-        clipped, fill = _count_i16(part, limit)
-        return clipped, fill, 0
-    if lowest == 0 and highest == 0:
-        return 0, 0, part.size // 2
-    return 0, 0, 0
+def _zero_samples(flat, looked, ahead, segment):
+    """Count samples of segments that are all zero: of others the first few tell.
+
+    What is left at the end and shorter counts with what lies before it: a single zero means nothing.
+    """
+    n_zero = 0
+    for first in range(looked, ahead, segment):
+        last = min(first + segment, ahead)
+        j = 2 * max(last - segment, 0)
+        while j < 2 * last and flat[j] == 0:
+            j += 1
+        if j == 2 * last:
+            n_zero += last - first
+    return n_zero
 
 
 @kernel
@@ -101,14 +107,26 @@ def _inspect_until_i16(flat, limit, segment, looked, end, found):
     ``found`` (3,) counts clipped and fill samples, and those of segments that are all zero.
     """
     n_sample = flat.size // 2
-    while looked < min(end, n_sample):
-        ahead = min(looked + segment, n_sample)
-        clipped, fill, zero = _inspect_segment_i16(flat[2 * looked : 2 * ahead], limit)
-        found[0] += clipped
-        found[1] += fill
-        found[2] += zero
+    end = min(end, n_sample)
+    while looked < end:
+        n_segment = min((end - looked + segment - 1) // segment, _STRETCH_SEGMENTS)
+        ahead = min(looked + n_segment * segment, n_sample)
+        stretch = flat[2 * looked : 2 * ahead]
+        lowest, highest = _extremes_i16(stretch)
+        if highest >= limit or lowest <= -limit:
+            clipped, fill = _count_i16(stretch, limit)
+            found[0] += clipped
+            found[1] += fill
+        found[2] += _zero_samples(flat, looked, ahead, segment)
         looked = ahead
     return looked
+
+
+@kernel_inline
+def _ask_ahead(pair, first, count):
+    """Ask the memory for samples that are folded later: what a processor foresees by itself ends with each page."""
+    for j in range(first + _AHEAD_SAMPLES, first + _AHEAD_SAMPLES + count, _LINE_SAMPLES):
+        prefetch(pair, j)
 
 
 @kernel_inline
@@ -139,29 +157,82 @@ def _add_two_rows_i16(x0, x1, a0, c0, a1, c1, re, im):
         im[j] += (i0 * c0 + q0 * a0) + (i1 * c1 + q1 * a1)
 
 
+@kernel_inline
+def _turn_inside(re, im, ramp_re, ramp_im):
+    for j in range(re.size):
+        turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
+        im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
+        re[j] = turned
+
+
+@kernel_inline
+def _put_sum_and_difference(first, after, sums, differences):
+    for j in range(first.size):
+        sums[j] = first[j] + after[j]
+        differences[j] = first[j] - after[j]
+
+
+@kernel_inline
+def _put(re, im, place, k, out):
+    """Bring a folded block (period,) into row k of ``out`` (class, block, 2·period/class); spoils ``re`` and ``im``.
+
+    Of four classes a line of c + 4i cycles in a period is in the c-th, which is put where ``place`` (4,) says: a line's
+    product with the quarters of a period differs from its product with the first by factors (−j)^c, so that they are
+    added up once for all lines of a class.
+    """
+    if out.shape[0] == 1:
+        for j in range(re.size):
+            out[0, k, j] = re[j]
+            out[0, k, re.size + j] = im[j]
+        return
+    n = re.size // 4
+    half = 2 * n
+    for part in (re, im):
+        for j in range(half):
+            first = part[j]
+            after = part[half + j]
+            part[j] = first + after
+            part[half + j] = first - after
+    even = out[place[0], k]
+    other = out[place[2], k]
+    _put_sum_and_difference(re[:n], re[n:half], even[:n], other[:n])
+    _put_sum_and_difference(im[:n], im[n:half], even[n:], other[n:])
+    back = out[place[1], k]
+    on = out[place[3], k]
+    _put_sum_and_difference(re[half : half + n], im[half + n :], back[:n], on[:n])
+    _put_sum_and_difference(im[half : half + n], re[half + n :], on[n:], back[n:])
+
+
 @kernel_fast
-def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
+def fold_flat_i16(samples, row, ramp, place, n_block, limit, segment, n_seen, out):
     """Fold and inspect in one pass over memory: blocks side by side, each row of a period turned as a whole.
 
-    ``flat`` (2·sample,) int16 and ``pair`` (sample,) int32 are the same samples; ``row_re``, ``row_im`` (fold,)
-    turn row by row and carry a factor 2⁻¹⁶, ``ramp_re``, ``ramp_im`` (period,) turn what is left inside a row.
-    ``out`` (block, 2·period); the last block may be cut short. Returns (clipped, fill, samples in all-zero segments) of
-    all samples but the first ``n_seen``.
+    ``samples`` (sample, 2) int16; ``row`` (2, fold) are real and imaginary part of what turns row by row and carry a
+    factor 2⁻¹⁶, ``ramp`` (2, period) of what turns what is left inside a row; ``place`` and ``out`` as `_put`. The last
+    block may be cut short. Returns (clipped, fill, samples in all-zero segments) of all samples but the first
+    ``n_seen``.
     """
+    flat = samples.reshape(samples.size)
+    pair = flat.view(np.int32)
+    row_re = row[0]
+    row_im = row[1]
+    ramp_re = ramp[0]
+    ramp_im = ramp[1]
     n_fold = row_re.size
     period = ramp_re.size
     n_sample = pair.size
     found = np.zeros(3, np.int64)
     looked = n_seen
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        for j in range(2 * period):
-            out[k, j] = 0.0
-        re = out[k, :period]
-        im = out[k, period:]
+        re[:] = np.float32(0.0)
+        im[:] = np.float32(0.0)
+        looked = _inspect_until_i16(flat, limit, segment, looked, (k + 1) * n_fold * period, found)
         for r in range(0, n_fold, 2):
             first = (k * n_fold + r) * period
             end = first + 2 * period
-            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
+            _ask_ahead(pair, first, end - first)
             if r + 1 < n_fold and end <= n_sample:
                 x = pair[first : first + period]
                 after = pair[first + period : end]
@@ -170,17 +241,15 @@ def fold_flat_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, 
             for one in range(r, min(r + 2, n_fold)):
                 first = min((k * n_fold + one) * period, n_sample)
                 _add_row_i16(pair[first : min(first + period, n_sample)], row_re[one], row_im[one], re, im)
-        for j in range(period):
-            turned = re[j] * ramp_re[j] - im[j] * ramp_im[j]
-            im[j] = re[j] * ramp_im[j] + im[j] * ramp_re[j]
-            re[j] = turned
+        _turn_inside(re, im, ramp_re, ramp_im)
+        _put(re, im, place, k, out)
     _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
     return found[0], found[1], found[2]
 
 
 @kernel_inline
-def _add_hann_row_i16(x, a, c, cosine, sine, sums):
-    """Add one row, turned by a + jc, to the plain sum and to those under a cosine and a sine."""
+def _add_hann_row_i16(x, weight, a, c, sums):
+    """Add one row, turned by a + jc, to the plain sum and to the weighted one."""
     for j in range(x.size):
         v = x[j]
         i = np.float32(np.int32(v << np.int32(16)))
@@ -189,14 +258,12 @@ def _add_hann_row_i16(x, a, c, cosine, sine, sums):
         im = i * c + q * a
         sums[0, j] += re
         sums[1, j] += im
-        sums[2, j] += cosine * re
-        sums[3, j] += cosine * im
-        sums[4, j] += sine * re
-        sums[5, j] += sine * im
+        sums[2, j] += weight[j] * re
+        sums[3, j] += weight[j] * im
 
 
 @kernel_inline
-def _add_two_hann_rows_i16(x0, x1, a0, c0, a1, c1, cosine0, sine0, cosine1, sine1, sums):
+def _add_two_hann_rows_i16(x0, x1, weight0, weight1, a0, c0, a1, c1, sums):
     """Like `_add_hann_row_i16` for two rows: the sums are loaded and stored half as often."""
     for j in range(x0.size):
         v0 = x0[j]
@@ -211,101 +278,88 @@ def _add_two_hann_rows_i16(x0, x1, a0, c0, a1, c1, cosine0, sine0, cosine1, sine
         im1 = i1 * c1 + q1 * a1
         sums[0, j] += re0 + re1
         sums[1, j] += im0 + im1
-        sums[2, j] += cosine0 * re0 + cosine1 * re1
-        sums[3, j] += cosine0 * im0 + cosine1 * im1
-        sums[4, j] += sine0 * re0 + sine1 * re1
-        sums[5, j] += sine0 * im0 + sine1 * im1
+        sums[2, j] += weight0[j] * re0 + weight1[j] * re1
+        sums[3, j] += weight0[j] * im0 + weight1[j] * im1
 
 
 @kernel_fast
-def fold_hann_i16(flat, pair, row_re, row_im, ramp_re, ramp_im, n_block, limit, segment, n_seen, out):
+def fold_hann_i16(samples, row, ramp, rising, place, n_block, limit, segment, n_seen, out):
     """Fold under Hann windows that cover each sample twice, and inspect, in one pass over memory.
 
-    As `fold_flat_i16`, with ``row_re``, ``row_im`` (fold,) of a whole window and ``n_block`` windows. With
-    ``A_r + B_j`` the window's angle at sample j of row r, its cosine is ``cos A_r cos B_j − sin A_r sin B_j``: half a
-    window is added up three times, plain, under ``cos A`` and under ``sin A``; in its second half, half a turn later,
-    the same sums belong to the window before with the other sign.
+    As `fold_flat_i16`, with ``row`` (2, fold) of a whole window and ``n_block`` windows; ``rising`` (fold/2 · period,)
+    is a window's first half. What a sample lacks of one under one window it has under the next, so that half a window
+    is added up twice, plain and weighted: weighted it belongs to the window that begins with it, and what is left of
+    the plain sum to the one before.
     """
+    flat = samples.reshape(samples.size)
+    pair = flat.view(np.int32)
+    row_re = row[0]
+    row_im = row[1]
+    ramp_re = ramp[0]
+    ramp_im = ramp[1]
     n_half = row_re.size // 2
     period = ramp_re.size
     n_sample = pair.size
-    turn_half = 2.0 * math.pi / (2 * n_half)
-    within_cos = np.empty(period, np.float32)
-    within_sin = np.empty(period, np.float32)
-    for j in range(period):
-        angle = turn_half * (j + 0.5) / period
-        within_cos[j] = 0.5 * math.cos(angle)
-        within_sin[j] = 0.5 * math.sin(angle)
-    cosine = np.empty(n_half, np.float32)
-    sine = np.empty(n_half, np.float32)
-    for r in range(n_half):
-        cosine[r] = math.cos(turn_half * r)
-        sine[r] = math.sin(turn_half * r)
     # of the second half against the first
     scale = np.float32(1.0) / (row_re[0] * row_re[0] + row_im[0] * row_im[0])
     on_re = (row_re[n_half] * row_re[0] + row_im[n_half] * row_im[0]) * scale
     on_im = (row_im[n_half] * row_re[0] - row_re[n_half] * row_im[0]) * scale
-    two = np.empty((2, 6, period), np.float32)
+    two = np.empty((2, 4, period), np.float32)
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     found = np.zeros(3, np.int64)
     looked = n_seen
     for s in range(n_block + 1):
         now = two[s % 2]
         now[:] = np.float32(0.0)
+        looked = _inspect_until_i16(flat, limit, segment, looked, (s + 1) * n_half * period, found)
         for r in range(0, n_half, 2):
             first = (s * n_half + r) * period
-            end = first + 2 * period
-            looked = _inspect_until_i16(flat, limit, segment, looked, end, found)
+            _ask_ahead(pair, first, 2 * period)
             x = pair[first : first + period]
+            weight = rising[r * period : (r + 1) * period]
             if r + 1 < n_half:
+                after = pair[first + period : first + 2 * period]
+                weight_after = rising[(r + 1) * period : (r + 2) * period]
                 _add_two_hann_rows_i16(
-                    x,
-                    pair[first + period : end],
-                    row_re[r],
-                    row_im[r],
-                    row_re[r + 1],
-                    row_im[r + 1],
-                    cosine[r],
-                    sine[r],
-                    cosine[r + 1],
-                    sine[r + 1],
-                    now,
+                    x, after, weight, weight_after, row_re[r], row_im[r], row_re[r + 1], row_im[r + 1], now
                 )
             else:
-                _add_hann_row_i16(x, row_re[r], row_im[r], cosine[r], sine[r], now)
+                _add_hann_row_i16(x, weight, row_re[r], row_im[r], now)
         if s == 0:
             continue
         before = two[(s - 1) % 2]
         for j in range(period):
-            flat_re = now[0, j] * on_re - now[1, j] * on_im
-            flat_im = now[0, j] * on_im + now[1, j] * on_re
-            cos_re = now[2, j] * on_re - now[3, j] * on_im
-            cos_im = now[2, j] * on_im + now[3, j] * on_re
-            sin_re = now[4, j] * on_re - now[5, j] * on_im
-            sin_im = now[4, j] * on_im + now[5, j] * on_re
-            re = np.float32(0.5) * (before[0, j] + flat_re)
-            im = np.float32(0.5) * (before[1, j] + flat_im)
-            re += within_sin[j] * (before[4, j] - sin_re) - within_cos[j] * (before[2, j] - cos_re)
-            im += within_sin[j] * (before[5, j] - sin_im) - within_cos[j] * (before[3, j] - cos_im)
-            out[s - 1, j] = re * ramp_re[j] - im * ramp_im[j]
-            out[s - 1, period + j] = re * ramp_im[j] + im * ramp_re[j]
+            left_re = now[0, j] - now[2, j]
+            left_im = now[1, j] - now[3, j]
+            re[j] = before[2, j] + left_re * on_re - left_im * on_im
+            im[j] = before[3, j] + left_re * on_im + left_im * on_re
+        _turn_inside(re, im, ramp_re, ramp_im)
+        _put(re, im, place, s - 1, out)
     _inspect_until_i16(flat, limit, segment, looked, n_sample, found)
     return found[0], found[1], found[2]
 
 
 @kernel_fast
-def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, n_block, out):
-    """Fold blocks that start every ``hop`` samples. ``pair`` (sample,) int32, ``out`` (block, 2·period) float32."""
+def fold_i16(pair, weight_re, weight_im, hop, n_fold, period, place, n_block, out):
+    """Fold blocks that start every ``hop`` samples: ``pair`` (sample,) int32; ``place`` and ``out`` as `_put`."""
     n_tap = n_fold * period
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+        _fold_block_i16(pair[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, re, im)
+        _put(re, im, place, k, out)
 
 
 @kernel_fast
-def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, n_block, out):
+def fold_c64(sample, weight_re, weight_im, hop, n_fold, period, place, n_block, out):
     """Like `fold_i16` for (sample,) complex64."""
     n_tap = n_fold * period
+    re = np.empty(period, np.float32)
+    im = np.empty(period, np.float32)
     for k in range(n_block):
-        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, out[k])
+        _fold_block_c64(sample[k * hop : k * hop + n_tap], weight_re, weight_im, n_fold, period, re, im)
+        _put(re, im, place, k, out)
 
 
 @kernel
@@ -443,20 +497,24 @@ def _phasors(cycles_hop, n_block, out):
 
 
 @kernel
-def turn_back(block, cycles_hop, out, tail):
-    """Turn (block, 2·line) float32 back by each line's own frequency: ``out`` (line, block) complex128.
+def turn_back(block, place, cycles_hop, out, tail):
+    """Turn lines back by their own frequencies: ``out`` (line, block) complex128.
 
-    One block more than ``out`` takes is the frame's tail, and goes to ``tail`` (line,).
+    ``block`` (class, block, 2·column) float32 holds real and then imaginary parts, ``place`` (line, 2) the class and
+    column of each line. One block more than ``out`` takes is the frame's tail, and goes to ``tail`` (line,).
     """
     n_line, n_block = out.shape
+    n_column = block.shape[2] // 2
     phasor = np.empty(n_block + 1, np.complex128)
     for m in range(n_line):
         _phasors(-cycles_hop[m], n_block + 1, phasor)
+        own = block[place[m, 0]]
+        i = place[m, 1]
         for k in range(n_block):
-            out[m, k] = complex(block[k, m], block[k, n_line + m]) * phasor[k]
+            out[m, k] = complex(own[k, i], own[k, n_column + i]) * phasor[k]
         tail[m] = 0.0
-        if block.shape[0] > n_block:
-            tail[m] = complex(block[n_block, m], block[n_block, n_line + m]) * phasor[n_block]
+        if own.shape[0] > n_block:
+            tail[m] = complex(own[n_block, i], own[n_block, n_column + i]) * phasor[n_block]
 
 
 @kernel
@@ -591,6 +649,64 @@ def noise_of_lines(stream, model, cycles_span, first, slope, first_middle, span,
     for m in range(n_line):
         variance[m] *= gain[m]
     return step, sigma
+
+
+@kernel
+def _product(a, b, out):
+    """Product of (row, inner) and (inner, column) complex128; numba's own would load scipy."""
+    for i in range(a.shape[0]):
+        row = out[i]
+        row[:] = 0.0
+        for k in range(a.shape[1]):
+            factor = a[i, k]
+            other = b[k]
+            for j in range(row.size):
+                row[j] += factor * other[j]
+
+
+@kernel
+def fit_lines(
+    stream,
+    tail,
+    turned_cycles,
+    cycles,
+    template_cycles,
+    below,
+    above,
+    part,
+    slope,
+    hop,
+    n_tail,
+    n_group,
+    centre,
+    amplitude,
+    variance,
+):
+    """Fit all lines of a frame: `group_lines`, `model_of_lines` and `noise_of_lines` one after the other.
+
+    One call, since each lets go of the interpreter, and threads would wait for it anew. ``turned_cycles`` (line,) were
+    the lines' frequencies when ``stream`` was turned back, ``cycles`` are; ``template_cycles`` those of the templates,
+    with the band's shift. Gives ``amplitude`` and ``variance`` (line,); returns the clock's step and its sigma.
+    """
+    n_line, n_block = stream.shape
+    n_part = n_block // n_group
+    span = hop * n_group
+    sums = np.empty(n_line, np.complex128)
+    gain = np.empty(n_line)
+    grouped = np.empty((n_line, n_part), np.complex128)
+    model = np.empty((n_line, n_part), np.complex128)
+    leaked = np.empty((n_line, n_part), np.complex128)
+    group = np.empty((n_line, n_line), np.complex128)
+    group_lines(stream, tail, (turned_cycles - cycles) * hop, n_group, sums, grouped)
+    inside = cycles - template_cycles
+    model_of_lines(
+        sums, below, above, part, cycles, inside, hop, n_block, n_tail, n_group, centre, amplitude, gain, group, model
+    )
+    # Groups keep the work small in long frames; they are alike, so that a few blocks at the end may be left out.
+    _product(group, model, leaked)
+    first = model[:, 0].copy()
+    first_middle = 0.5 * span - 0.5 - centre
+    return noise_of_lines(grouped, leaked, cycles * span, first, slope, first_middle, span, gain, variance)
 
 
 @kernel

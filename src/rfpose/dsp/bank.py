@@ -40,7 +40,7 @@ _HANN_GAP_BINS = 40.0
 _LONGEST_BLOCK = 1600
 _LONGEST_FOLDED_BLOCK = 16384
 _ZERO_SEGMENT = 256
-_TILE_VALUES, _MIN_TILE = 2**16, 32  # float32 values of folded blocks held at a time, which should fit the cache
+_TILE_VALUES, _MIN_TILE = 2**18, 32  # float32 values of folded blocks held at a time, which should fit the cache
 _MAX_FOLDS = 512  # clock offsets whose turns are kept
 
 
@@ -68,7 +68,17 @@ class ClockRange(NamedTuple):
 
 
 Fold = Callable[[Samples, int, int, npt.NDArray[np.float32]], Inspection]
-"""Folds (sample, 2), of which the first so many were inspected before, into so many rows of (block, 2·period)."""
+"""Folds (sample, 2), of which the first so many were inspected before, into so many rows of (class, block, value)."""
+
+
+class _Turned(NamedTuple):
+    """What a bank needs at a clock offset."""
+
+    cycles: FloatArray
+    cycles_hop: FloatArray
+    shift_cycles: float
+    fold: Fold
+    """Of what is folded and inspected in one pass."""
 
 
 def inspect(samples: Samples, full_scale: float) -> Inspection:
@@ -189,13 +199,16 @@ class LineBank:
         self.hop = self.n_tap // overlap
         self.n_block = (n_sample - self.n_tap) // self.hop + 1
         self.n_tail = 0 if windowed else n_sample - self.n_block * self.hop
+        n_row = self.n_block + (self.n_tail > 0)
+        self._tile = min(n_row, max(_MIN_TILE, _TILE_VALUES // (2 * self.period)))
         self.template_cycles = plan.line_hz / plan.sample_rate_hz
-        self._matrix = _line_matrix(self.template_cycles, self.period)
+        self._classes = _Classes.of(self.template_cycles, self.period, on_grid=self.period == plan.grid)
         n = np.arange(self.n_tap)
         self._envelope = np.sum(
             [a * np.cos(2.0 * np.pi * h * (n + 0.5) / n.size) for h, a in enumerate(self.window)], 0
         )
-        self._fold = lru_cache(maxsize=_MAX_FOLDS)(self._fold_at)
+        self._turned = lru_cache(maxsize=_MAX_FOLDS)(self._turned_at)
+        self._weighted = lru_cache(maxsize=_MAX_FOLDS)(self._weighted_at)
 
     def streams(self, samples: Samples, clock_ppm: float) -> LineStreams:
         """Separate one frame.
@@ -207,22 +220,22 @@ class LineBank:
         clock_ppm
             Assumed clock offset [ppm].
         """
-        cycles = self.plan.line_cycles(clock_ppm)
-        shift = self.plan.common_shift_cycles(clock_ppm)
-        fold = self._fold(shift)
-        n_line, n_row = len(cycles), self.n_block + (self.n_tail > 0)
-        blocks = np.empty((n_row, 2 * n_line), np.float32)
-        tile = min(n_row, max(_MIN_TILE, _TILE_VALUES // (2 * self.period)))
-        folded = np.empty((tile, 2 * self.period), np.float32)
-        counts = NOTHING_WRONG if self.inspects(samples) else inspect(samples, self.full_scale)
-        for first in range(0, n_row, tile):
-            count = min(tile, n_row - first)
+        turned, is_inspected = self._turned(clock_ppm), self.inspects(samples)
+        fold = turned.fold if is_inspected else self._weighted(clock_ppm)
+        n_line, n_row = len(self.template_cycles), self.n_block + (self.n_tail > 0)
+        classes = self._classes
+        n_class, n_value, n_column = classes.matrix.shape
+        blocks = np.empty((n_class, n_row, n_column), np.float32)
+        folded = np.empty((classes.n_folded, self._tile, n_value), np.float32)
+        counts = NOTHING_WRONG if is_inspected else inspect(samples, self.full_scale)
+        for first in range(0, n_row, self._tile):
+            count = min(self._tile, n_row - first)
             end = self.n_sample if first + count == n_row else (first + count - 1) * self.hop + self.n_tap
             n_seen = self.n_tap - self.hop if first else 0
             counts = counts.added(fold(samples[first * self.hop : end], n_seen, count, folded))
-            np.matmul(folded[:count], self._matrix, out=blocks[first : first + count])
+            np.matmul(folded[:n_class, :count], classes.matrix, out=blocks[:, first : first + count])
         stream, tail = np.empty((n_line, self.n_block), np.complex128), np.empty(n_line, np.complex128)
-        _kernels.turn_back(blocks, cycles * self.hop, stream, tail)
+        _kernels.turn_back(blocks, classes.place_of_line, turned.cycles_hop, stream, tail)
         return LineStreams(
             stream=stream,
             tail=tail,
@@ -231,8 +244,8 @@ class LineBank:
             n_tail=self.n_tail,
             n_sample=self.n_sample,
             clock_ppm=clock_ppm,
-            cycles=cycles,
-            shift_cycles=shift,
+            cycles=turned.cycles,
+            shift_cycles=turned.shift_cycles,
             template_cycles=self.template_cycles,
             window=self.window,
             inspection=counts,
@@ -244,30 +257,33 @@ class LineBank:
         halves = self.window == HANN and self.n_fold % 2 == 0
         return samples.dtype == np.int16 and (self.window == BOXCAR or halves)
 
-    def _fold_at(self, shift_cycles: float) -> Fold:
-        """Return what folds blocks whose band is turned back by ``shift_cycles`` a sample."""
+    def _turned_at(self, clock_ppm: float) -> _Turned:
+        cycles, shift = self.plan.line_cycles(clock_ppm), self.plan.common_shift_cycles(clock_ppm)
+        return _Turned(cycles, cycles * self.hop, shift, self._one_pass(*self._turns(shift)))
+
+    def _turns(self, shift_cycles: float) -> tuple[ComplexArray, ComplexArray]:
+        """Return what turns the band back by ``shift_cycles`` a sample: (fold,) row by row, (period,) inside a row."""
         row = np.exp(-2j * np.pi * shift_cycles * self.period * np.arange(self.n_fold))
-        ramp = np.exp(-2j * np.pi * shift_cycles * np.arange(self.period))
-        one_pass = self._one_pass(row, ramp)
-        weighted = self._weighted(row, ramp)
-        return lambda samples, *rest: (one_pass if self.inspects(samples) else weighted)(samples, *rest)
+        return row, np.exp(-2j * np.pi * shift_cycles * np.arange(self.period))
 
     def _one_pass(self, row: ComplexArray, ramp: ComplexArray) -> Fold:
-        turns = [part.astype(np.float32) for z in (row * 2.0**-16, ramp) for part in (z.real, z.imag)]
+        turns = [np.stack([z.real, z.imag]).astype(np.float32) for z in (row * 2.0**-16, ramp)]
         limit = np.int16(min(self.full_scale, 32767.0))
-        kernel = _kernels.fold_hann_i16 if self.window == HANN else _kernels.fold_flat_i16
+        place, kernel = self._classes.place, _kernels.fold_flat_i16
+        if self.window == HANN:
+            kernel = _kernels.fold_hann_i16
+            turns.append(self._envelope[: self.hop].astype(np.float32))
 
         def fold(samples: Samples, n_seen: int, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
-            pair = samples.view(np.int32).ravel()
-            flat = samples.reshape(-1)
-            clipped, fill, zero = kernel(flat, pair, *turns, n_block, limit, _ZERO_SEGMENT, n_seen, out)
+            clipped, fill, zero = kernel(samples, *turns, place, n_block, limit, _ZERO_SEGMENT, n_seen, out)
             return Inspection(clipped, fill, zero, 0)
 
         return fold
 
-    def _weighted(self, row: ComplexArray, ramp: ComplexArray) -> Fold:
+    def _weighted_at(self, clock_ppm: float) -> Fold:
+        row, ramp = self._turns(self.plan.common_shift_cycles(clock_ppm))
         weight = (self._envelope * np.multiply.outer(row, ramp).ravel()).astype(np.complex64)
-        parts = np.ascontiguousarray(weight.real), np.ascontiguousarray(weight.imag)
+        parts, place = (np.ascontiguousarray(weight.real), np.ascontiguousarray(weight.imag)), self._classes.place
 
         def fold(samples: Samples, n_seen: int, n_block: int, out: npt.NDArray[np.float32]) -> Inspection:
             is_int = samples.dtype == np.int16
@@ -276,7 +292,7 @@ class LineBank:
                 samples = np.concatenate([samples, np.zeros((short, 2), samples.dtype)])
             flat = samples.view(np.int32 if is_int else np.complex64).ravel()
             kernel = _kernels.fold_i16 if is_int else _kernels.fold_c64
-            kernel(flat, *parts, self.hop, self.n_fold, self.period, n_block, out)
+            kernel(flat, *parts, self.hop, self.n_fold, self.period, place, n_block, out)
             return NOTHING_WRONG
 
         return fold
@@ -323,9 +339,43 @@ def _folding(grid: int | None, n_tap: int, multiple: int) -> tuple[int, int]:
     return -(-n_tap // multiple) * multiple, 1
 
 
-def _line_matrix(template_cycles: FloatArray, period: int) -> npt.NDArray[np.float32]:
-    """(2·period, 2·line): multiplies folded [re, im] into [re, im] of each line."""
-    turn = np.exp(-2j * np.pi * np.outer(np.arange(period), template_cycles))
-    top = np.hstack([turn.real, turn.imag])
-    bottom = np.hstack([-turn.imag, turn.real])
-    return np.ascontiguousarray(np.vstack([top, bottom]), np.float32)
+@dataclass(frozen=True, slots=True)
+class _Classes:
+    """How lines are told apart in folded blocks: those of a class share a quarter of the work, see `_kernels._put`.
+
+    Attributes
+    ----------
+    n_folded
+        Classes of folded blocks, of which the first ones hold lines.
+    place : (n_folded,)
+        Where each class is among them.
+    matrix : (class, value, 2·column)
+        Multiplies folded [re, im] into [re, im] of a class's lines.
+    place_of_line : (line, 2)
+        Class and column of each line.
+    """
+
+    n_folded: int
+    place: npt.NDArray[np.int64]
+    matrix: npt.NDArray[np.float32]
+    place_of_line: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, template_cycles: FloatArray, period: int, *, on_grid: bool) -> _Classes:
+        n_folded = 4 if on_grid and period % 4 == 0 else 1
+        own = np.rint(template_cycles * period).astype(np.int64) % n_folded
+        order = np.array(sorted(range(n_folded), key=lambda c: c not in own))
+        place = np.argsort(order)
+        column = np.array([np.count_nonzero(own[:m] == own[m]) for m in range(len(own))])
+        n_column = int(column.max()) + 1
+        n_value = 2 * (period // n_folded)
+        matrix = np.zeros((len(np.unique(own)), n_value, 2, n_column), np.float32)
+        for m, cycles in enumerate(template_cycles):
+            matrix[place[own[m]], :, :, column[m]] = _line_matrix(cycles, period // n_folded)
+        return cls(n_folded, place, matrix.reshape(len(matrix), n_value, -1), np.stack([place[own], column], axis=1))
+
+
+def _line_matrix(template_cycles: float, n: int) -> FloatArray:
+    """(2·n, 2): multiplies folded [re, im] into [re, im] of a line."""
+    turn = np.exp(-2j * np.pi * np.arange(n) * template_cycles)
+    return np.vstack([np.stack([turn.real, turn.imag], axis=1), np.stack([-turn.imag, turn.real], axis=1)])

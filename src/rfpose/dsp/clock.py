@@ -13,7 +13,7 @@ from rfpose.dsp import _kernels
 from rfpose.dsp.bank import LineBank, LineStreams
 from rfpose.dsp.plan import LinePlan
 
-__all__ = ["SEARCH_SAMPLES", "coarse_clock_ppm", "refine_clock", "search_bank"]
+__all__ = ["SEARCH_SAMPLES", "ClockSearch", "coarse_clock_ppm", "search_bank"]
 
 ComplexArray = npt.NDArray[np.complex128] | npt.NDArray[np.complex64]
 Samples = npt.NDArray[np.int16] | npt.NDArray[np.float32]
@@ -81,41 +81,48 @@ def _hanning(n: int) -> npt.NDArray[np.float32]:
     return np.hanning(n).astype(np.float32)
 
 
-def refine_clock(streams: LineStreams, plan: LinePlan, range_ppm: float) -> tuple[float, float, float]:
-    """Refine the clock offset to the maximum of the power that the carriers add up to over the frame.
+class ClockSearch:
+    """Refines a clock offset to the maximum of the power that the carriers add up to over the frame.
 
     Maximum likelihood for carriers of unknown complex amplitude that do not overlap, in white noise. The sidebands
     would add a few percent at three times the work.
 
     Parameters
     ----------
-    streams
-        Separated at the clock offset to begin with.
+    bank
+        That separates the lines.
     range_ppm
-        Search plus and minus this about it; never beyond what one block can tell apart.
-
-    Returns
-    -------
-    clock_ppm
-        Refined offset.
-    curvature
-        Minus half the second derivative of the log likelihood, before division by the noise [1/ppm²].
-    coherence
-        Power at the refined offset over what it would be if all blocks added up: one without noise.
+        Search plus and minus this about the offset to begin with; never beyond what one block can tell apart.
     """
-    every = 1 + 2 * plan.n_tone
-    slope_hop = plan.cycles_per_ppm()[::every] * streams.hop
-    steepest = float(np.abs(slope_hop).max())
-    n_group = _group_length(streams.n_block, steepest * range_ppm)
-    n_part = streams.n_block // n_group
-    steepest *= n_group
-    step = 0.25 / (n_part * steepest)
-    reach = min(range_ppm, 0.45 / steepest)
-    n_side = math.ceil(reach / step) if n_part > 1 else 0
-    offset, curvature, coherent, incoherent = _kernels.most_coherent(
-        streams.stream, every, n_group, slope_hop * n_group, n_side, step
-    )
-    return streams.clock_ppm + offset, curvature, coherent / incoherent if incoherent > 0.0 else 0.0
+
+    def __init__(self, bank: LineBank, range_ppm: float) -> None:
+        self._every = 1 + 2 * bank.plan.n_tone
+        slope_hop = bank.plan.cycles_per_ppm()[:: self._every] * bank.hop
+        steepest = float(np.abs(slope_hop).max())
+        self._n_group = _group_length(bank.n_block, steepest * range_ppm)
+        self._slope = slope_hop * self._n_group
+        n_part = bank.n_block // self._n_group
+        steepest *= self._n_group
+        self._step = 0.25 / (n_part * steepest)
+        reach = min(range_ppm, 0.45 / steepest)
+        self._n_side = math.ceil(reach / self._step) if n_part > 1 else 0
+
+    def __call__(self, streams: LineStreams) -> tuple[float, float, float]:
+        """Refine the offset at which a frame was separated.
+
+        Returns
+        -------
+        clock_ppm
+            Refined offset.
+        curvature
+            Minus half the second derivative of the log likelihood, before division by the noise [1/ppm²].
+        coherence
+            Power at the refined offset over what it would be if all blocks added up: one without noise.
+        """
+        offset, curvature, coherent, incoherent = _kernels.most_coherent(
+            streams.stream, self._every, self._n_group, self._slope, self._n_side, self._step
+        )
+        return streams.clock_ppm + offset, curvature, coherent / incoherent if incoherent > 0.0 else 0.0
 
 
 def _group_length(n_block: int, turns: float) -> int:

@@ -83,42 +83,24 @@ class JointFit:
             Where the clock is now assumed [ppm].
         """
         cycles = self.plan.line_cycles(clock_ppm)
-        n_line, n_part = len(cycles), streams.n_block // self.n_group
-        hop, span = streams.hop, streams.hop * self.n_group
         below = math.floor(clock_ppm / self.step_ppm)
         turned = round(streams.clock_ppm / self.step_ppm)
-        sums, amplitude = np.empty((2, n_line), np.complex128)
-        gain, variance = np.empty((2, n_line))
-        grouped, model = np.empty((2, n_line, n_part), np.complex128)
-        group = np.empty((n_line, n_line), np.complex128)
-        _kernels.group_lines(streams.stream, streams.tail, (streams.cycles - cycles) * hop, self.n_group, sums, grouped)
-        _kernels.model_of_lines(
-            sums,
+        amplitude, variance = np.empty(len(cycles), np.complex128), np.empty(len(cycles))
+        step, sigma = _kernels.fit_lines(
+            streams.stream,
+            streams.tail,
+            streams.cycles,
+            cycles,
+            streams.template_cycles + streams.shift_cycles,
             self._mixing(turned, below),
             self._mixing(turned, below + 1),
             clock_ppm / self.step_ppm - below,
-            cycles,
-            cycles - streams.shift_cycles - streams.template_cycles,
-            hop,
-            streams.n_block,
+            self._slope,
+            streams.hop,
             streams.n_tail,
             self.n_group,
             streams.centre,
             amplitude,
-            gain,
-            group,
-            model,
-        )
-        # Groups keep the work small in long frames; they are alike, so that a few blocks at the end may be left out.
-        step, sigma = _kernels.noise_of_lines(
-            grouped,
-            group @ model,
-            cycles * span,
-            np.ascontiguousarray(model[:, 0]),
-            self._slope,
-            0.5 * span - 0.5 - streams.centre,
-            span,
-            gain,
             variance,
         )
         return LineFit(amplitude=amplitude, variance=variance, clock_step_ppm=step, clock_step_sigma_ppm=sigma)

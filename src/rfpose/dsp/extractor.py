@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray
 from rfpose.dsp import _kernels, hilbert
 from rfpose.dsp.bank import ClockRange, Inspection, LineBank, LineStreams, inspect
-from rfpose.dsp.clock import SEARCH_SAMPLES, coarse_clock_ppm, refine_clock, search_bank
+from rfpose.dsp.clock import SEARCH_SAMPLES, ClockSearch, coarse_clock_ppm, search_bank
 from rfpose.dsp.correlator import JointFit
 from rfpose.dsp.plan import LinePlan
 from rfpose.dsp.tones import FrameTones, LineStatus
@@ -70,6 +70,7 @@ class ToneExtractor:
         self._wide_bank = lru_cache(maxsize=4)(lambda n_sample: search_bank(plan, n_sample))
         self._fit = lru_cache(maxsize=16)(JointFit)
         self._drift_ppm = min(_CLOCK_DRIFT_PPM, plan.clock_search_ppm)
+        self._refine = lru_cache(maxsize=16)(lambda bank: ClockSearch(bank, self._drift_ppm))
 
     def _bank_at(self, n_sample: int, clock_ppm: float) -> LineBank:
         """Return the bank for frames of a receiver whose clock is followed."""
@@ -100,8 +101,8 @@ class ToneExtractor:
             return np.nan
         coarse = coarse_clock_ppm(x, self.plan, self._wide_bank(len(x)))
         bin_ppm = 1.0 / (min(len(x), SEARCH_SAMPLES) * float(np.max(np.abs(self.plan.cycles_per_ppm()))))
-        streams = self._search_bank(len(x)).streams(x, coarse)
-        return refine_clock(streams, self.plan, min(bin_ppm, self.plan.clock_search_ppm))[0]
+        bank = self._search_bank(len(x))
+        return ClockSearch(bank, min(bin_ppm, self.plan.clock_search_ppm))(bank.streams(x, coarse))[0]
 
     def measure(self, samples: npt.ArrayLike, *, clock_ppm: float | None = None) -> FrameTones:
         """Measure one frame of one receiver.
@@ -133,14 +134,14 @@ class ToneExtractor:
         fault, clipped = _fault(streams.inspection, len(x)), streams.inspection.clipped / len(x)
         if fault is not LineStatus.OK:
             return FrameTones.failed(self.plan.n_transmitter, self.plan.n_tone, fault, clipped_fraction=clipped)
-        ppm, curvature, coherence = refine_clock(streams, self.plan, self._drift_ppm)
+        ppm, curvature, coherence = self._refine(bank)(streams)
         if clock_ppm is not None and coherence < 0.5:
             # the lines do not add up: either all is noise, or the clock has jumped
             again = self.acquire_clock(x)
             if abs(again - ppm) > self._drift_ppm:
                 bank = self._bank_at(len(x), again)
                 streams = bank.streams(x, self._fit(bank).node_ppm(again))
-                ppm, curvature, _ = refine_clock(streams, self.plan, self._drift_ppm)
+                ppm, curvature, _ = self._refine(bank)(streams)
         if self.estimator != "correlator":
             return self._from_filters(streams, ppm, curvature, clipped)
         fit = self._fit(bank)(streams, ppm)
