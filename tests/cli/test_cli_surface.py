@@ -296,7 +296,12 @@ def test_a_command_loads_what_it_needs(small_job: Path) -> None:
         ),
         ("process recording.h5 -o again.h5 --estimator correlator --force", SLOW_TO_LOAD),
     ]
-    for together in (given, [("layout map site.toml", NO_SCIPY)]):
+    studies = (*NO_SCIPY, "rfpose.layout.budget", "rfpose.pipeline.site")
+    layouts = [
+        ("layout map site.toml", studies),
+        ("layout optimise site.toml -o better.toml --starts 2", studies),
+    ]
+    for together in (given, layouts):
         found, _ = _loaded(small_job, together)
         assert found == [[words, 0, []] for words, _ in together]
 

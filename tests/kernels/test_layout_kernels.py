@@ -6,7 +6,7 @@ import pytest
 from rfpose.layout import maps
 from rfpose.layout.maps import ESTIMATORS, dilution, mirrors_facing, normal_map
 from rfpose.layout.optimise import CRITERIA
-from rfpose.layout.optimise.search import _rows
+from rfpose.layout.optimise.problem import variances_of
 from rfpose.measurement import Estimator, Noise
 from rfpose.multilat import dop, normal_bound, position_bound
 from rfpose.multilat.rigid import MirrorKnowledge, MirrorProblem, rigid_bound, tilt_sigma_rad
@@ -128,12 +128,13 @@ def test_mirror_that_sees_too_little_is_nan(mirrors):
 
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_gradient_is_the_difference(mirrors, criterion):
-    _, slope = _rows(TRANSMITTER, mirrors, criterion, 1e-3)
+    slope = variances_of(TRANSMITTER[None], mirrors, criterion, 1e-3)[1][0]
     step = np.array([2.0, -1.0, 3.0]) * 1e-4
     ahead, behind = TRANSMITTER.copy(), TRANSMITTER.copy()
     ahead[6] += step
     behind[6] -= step
-    change = 0.5 * (_rows(ahead, mirrors, criterion, 1e-3)[0] - _rows(behind, mirrors, criterion, 1e-3)[0])
+    variance, _ = variances_of(np.stack([ahead, behind]), mirrors, criterion, 1e-3)
+    change = 0.5 * (variance[0] - variance[1])
     np.testing.assert_allclose(slope[:, 6] @ step, change, rtol=1e-4, atol=1e-7 * np.abs(change).max())
 
 
@@ -141,6 +142,6 @@ def test_gradient_is_the_difference(mirrors, criterion):
     ("criterion", "estimator"), [("independent", "independent"), ("rigid", "rigid"), ("shared-clock", "shared-clock")]
 )
 def test_what_is_optimised_is_what_is_mapped(mirrors, criterion, estimator):
-    variance, _ = _rows(TRANSMITTER, mirrors, criterion, 1e-3)
+    variance = variances_of(TRANSMITTER[None], mirrors, criterion, 1e-3)[0][0]
     got = normal_map(TRANSMITTER, mirrors, Noise.uniform(10, 1e-3), ESTIMATORS[estimator])
     np.testing.assert_allclose(np.sqrt(variance), got, rtol=1e-9)

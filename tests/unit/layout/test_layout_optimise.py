@@ -17,6 +17,8 @@ from rfpose.layout.optimise import (
     measured,
     optimise,
 )
+from rfpose.layout.optimise.descent import minimised
+from rfpose.layout.optimise.problem import draw_places, problem_of
 from rfpose.pipeline.layout import Rules
 
 TRIANGLE = 0.01 * np.array([[1.0, 0.0, 0.0], [-0.5, 0.866, 0.0], [-0.5, -0.866, 0.0]])
@@ -37,6 +39,35 @@ def test_search_improves_and_repeats(statistic):
         assert evaluate_placement(near, FIELD, statistic=statistic) > first.value * 0.999
     assert first.value == pytest.approx(evaluate_placement(first.transmitter_enu_m, FIELD, statistic=statistic))
     assert first.lost_one > first.value
+
+
+@pytest.mark.parametrize("statistic", ["rms", "worst", "p90"])
+@pytest.mark.parametrize("criterion", ["pdop", "independent", "rigid", "shared-clock"])
+def test_slopes_of_the_search_are_those_of_differences(criterion, statistic):
+    square = Zone(corner_enu_m=np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]))
+    rules = Constraints(
+        allowed=(square, Zone(centre_enu_m=(2.0, 0.0), radius_m=0.3)), excluded=(Zone(radius_m=0.2, top_m=0.4),),
+        height_m=(0.2, 0.5), separation_m=0.1, clearance_m=0.02, sight=SIGHT,
+    )  # fmt: skip
+    standing = np.array([[0.0, 0.0, 0.6], [0.9, 0.9, 0.4]])
+    problem = problem_of(FIELD, criterion, statistic, 1.0, standing, rules)
+    rng = np.random.default_rng(2)
+    x = np.stack([draw_places(problem, 6, rng).ravel() for _ in range(3)]) / problem.scale
+    step = 1e-6
+    value, slope = problem.objective(x)
+    margin, by = problem.margins(x)
+    assert margin.min() >= 0.0
+    for k in range(x.shape[1]):
+        moved = step * np.eye(x.shape[1])[k]
+        ahead, behind = problem.objective(x + moved)[0], problem.objective(x - moved)[0]
+        # ranks of a percentile are held
+        assert statistic == "p90" or (ahead - behind) / (2.0 * step) == pytest.approx(slope[:, k], rel=1e-4, abs=1e-5)
+        change = (problem.margins(x + moved)[0] - problem.margins(x - moved)[0]) / (2.0 * step)
+        np.testing.assert_allclose(change, by[:, k], atol=1e-4)
+    for k in range(3):  # each is worked out alike, whichever others are beside it
+        alone = (*problem.objective(x[k : k + 1]), *problem.margins(x[k : k + 1]))
+        for one, together in zip(alone, (value, slope, margin, by), strict=True):
+            np.testing.assert_array_equal(one[0], together[k])
 
 
 def test_every_constraint_is_met():
@@ -190,8 +221,7 @@ SIGHT = Sightlines(start_enu_m=PIVOTS, end_enu_m=np.broadcast_to(AIM, (3, 3)), c
 def test_tower_is_clear_of_a_line_beside_it_or_below() -> None:
     tower = np.array([[0.4, 0.0, 0.2], [0.4, 0.0, 0.3], [0.4, 0.12, 0.3], [0.0, 0.0, 0.5], [1.2, 0.0, 0.4]])
     # the first line passes x = 0.4 at a height of 0.26; where it ends stands the receiver's own tower
-    margin, _ = SIGHT.margin(tower)
-    assert margin == pytest.approx([0.01, -0.04 - 0.01, 0.07, 0.0, 0.35])
+    assert SIGHT.margin(tower) == pytest.approx([0.01, -0.04 - 0.01, 0.07, 0.0, 0.35])
     assert [SIGHT.crossed(each[None]) for each in tower] == [0, 1, 0, 0, 0]
     assert SIGHT.crossed(np.vstack([tower, [[0.0, 0.3, 0.45]]])) == 2
 
@@ -199,11 +229,24 @@ def test_tower_is_clear_of_a_line_beside_it_or_below() -> None:
 def test_slope_of_clearance_is_that_of_differences() -> None:
     rng = np.random.default_rng(5)
     tower = np.column_stack([rng.uniform(-1.0, 1.0, (200, 2)), rng.uniform(0.05, 0.5, 200)])
-    margin, slope = SIGHT.margin(tower)
+    margin, slope = SIGHT.margins(tower)
+    np.testing.assert_array_equal(margin[:, 0], SIGHT.margin(tower))
     step = 1e-7 * rng.normal(size=(200, 3))
-    change = SIGHT.margin(tower + step)[0] - margin
+    change = SIGHT.margin(tower + step) - margin[:, 0]
     # but for the few that lie on an edge, where another line becomes the worst
-    assert np.mean(np.abs(change - (slope * step).sum(axis=1)) < 1e-3 * 1e-7) > 0.98
+    assert np.mean(np.abs(change - (slope[:, 0] * step).sum(axis=1)) < 1e-3 * 1e-7) > 0.98
+
+
+def test_tower_between_lines_is_kept_clear_of_both() -> None:
+    # on the line that halves the angle between the first two lines of sight
+    middle = PIVOTS[0, :2] / np.linalg.norm(PIVOTS[0, :2]) + PIVOTS[1, :2] / np.linalg.norm(PIVOTS[1, :2])
+    tower = np.array([[*(0.2 * middle), 0.6], [0.4, 0.1, 0.6]])
+    margin, slope = SIGHT.margins(tower)
+    assert margin[0, :2] == pytest.approx([margin[0, 0]] * 2, abs=1e-12)
+    assert abs(slope[0, 0] - slope[0, 1]).max() > 0.5
+    # the other has one line that is nearest by far
+    np.testing.assert_array_equal(margin[1], margin[1, :1].repeat(3))
+    np.testing.assert_array_equal(slope[1], slope[1, :1].repeat(3, axis=0))
 
 
 def test_search_keeps_new_towers_out_of_lines_of_sight() -> None:
@@ -214,8 +257,27 @@ def test_search_keeps_new_towers_out_of_lines_of_sight() -> None:
     rules = Constraints(allowed=DISC.allowed, height_m=DISC.height_m, sight=sight)
     kept = optimise(7, FIELD, rules, starts=2, seed=3)
     assert sight.crossed(bare.transmitter_enu_m) > 0
-    assert sight.margin(kept.transmitter_enu_m)[0].min() > -1e-5
+    assert sight.margin(kept.transmitter_enu_m).min() > -1e-5
     assert kept.value >= bare.value * 0.999
+
+
+def test_search_that_an_edge_stops_begins_its_model_anew():
+    point = disc_points(12, radius_m=0.8)
+    sight = Sightlines(start_enu_m=point, end_enu_m=np.broadcast_to(AIM, point.shape), clearance_m=0.25)
+    rules = Constraints(allowed=DISC.allowed, height_m=DISC.height_m, sight=sight)
+    problem = problem_of(mirrors_facing(point, TRIANGLE, normal_enu=[0.0, -0.5, 1.0]), "pdop", "rms", 1.0,
+                         np.empty((0, 3)), rules)  # fmt: skip
+    rng, calls = np.random.default_rng(0), []
+    start = np.stack([draw_places(problem, 6, rng).ravel() for _ in range(20)]) / problem.scale
+
+    def counted(x):
+        calls.append(len(x))
+        return problem.objective(x)
+
+    end = minimised(counted, problem.margins, start, tolerance=1e-7)
+    # one that tries the same step again and again takes thousands
+    assert len(calls) < 600
+    assert problem.objective(end)[0].min() < 0.785
 
 
 def test_above_its_top_an_excluded_place_is_free():

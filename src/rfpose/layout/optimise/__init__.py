@@ -1,10 +1,9 @@
 """Where to put transmitters: what is allowed, what it costs, and the search."""
 
 from rfpose.layout.optimise.exchange import Measure, exchange, measured
+from rfpose.layout.optimise.problem import CRITERIA, Criterion
 from rfpose.layout.optimise.rules import Constraints, Costs, Sightlines, Zone
 from rfpose.layout.optimise.search import (
-    CRITERIA,
-    Criterion,
     Placement,
     Progress,
     efficient,

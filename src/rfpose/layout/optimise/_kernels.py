@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from rfpose.jit import kernel, kernel_rows
-from rfpose.layout._kernels import FLOOR, directions, invert, look, torque, turn_slopes
+from rfpose.layout._kernels import FLOOR, arm_of, directions, invert, torque, turn_slopes
 
 DOP, INDEPENDENT, RIGID, SHARED = 0, 1, 2, 3
 
 
 @kernel_rows
-def objective_rows(begin, end, method, field, weight, plane_slope, value, gradient):
-    """Variance at each field point and its derivative by every transmitter's position (point, transmitter, 3).
+def objective_rows(begin, end, method, transmitter, place, pivot, rot, weight, plane_slope, value, gradient):
+    """Variance at each field point and its derivative by every transmitter's position.
 
+    ``transmitter`` (site, xyz, transmitter), ``place``, ``pivot`` and ``rot`` as in `FieldArrays`, ``value`` (site,
+    point), ``gradient`` (site, point, transmitter, xyz); the row of a site's point is site · points + point.
     ``method`` is DOP (position, ``place`` unused), INDEPENDENT, RIGID or SHARED; calibration is perfect, all is seen.
     Writing the variance as tr(G N⁻¹) with N = Σ w ĵ ĵᵀ over centred rows, its change is −2 Σ w ĵᵀ (N⁻¹GN⁻¹) dj.
     """
-    n_transmitter = field.transmitter.shape[1]
-    n_receiver = 1 if method == DOP else field.place.shape[1]
-    pivot, rot = field.pivot, field.rot
+    n_point, n_transmitter = pivot.shape[0], transmitter.shape[2]
+    n_receiver = 1 if method == DOP else place.shape[1]
     size = 3 if method <= INDEPENDENT else 6
     u = np.empty((n_receiver, 3, n_transmitter))
     inverse = np.empty((n_receiver, n_transmitter))
@@ -31,16 +32,17 @@ def objective_rows(begin, end, method, field, weight, plane_slope, value, gradie
     weighed = np.empty((6, 6))
     cov = np.empty((6, 6))
     q3 = np.empty((3, 3))
-    for i in range(begin, end):
+    for k in range(begin, end):
+        site, i = k // n_point, k % n_point
         if method == INDEPENDENT:
             turn_slopes(rot[i], plane_slope[i % plane_slope.shape[0]], jac)
         for r in range(n_receiver):
-            if method == DOP:
-                directions(field.transmitter, pivot[i, 0], pivot[i, 1], pivot[i, 2], u[r], inverse[r])
-            else:
-                look(field, i, r, arm[r], u[r], inverse[r])
+            if method != DOP:
+                arm_of(rot[i], place[i % place.shape[0], r], arm[r])
+            x, y, z = pivot[i, 0] + arm[r, 0], pivot[i, 1] + arm[r, 1], pivot[i, 2] + arm[r, 2]
+            directions(transmitter[site], x, y, z, u[r], inverse[r])
         fill_rows(u, arm, weight, size, method == SHARED, row, mean)
-        value[i] = 0.0
+        total = 0.0
         info[:] = 0.0
         for r in range(n_receiver):
             if size == 3:
@@ -53,18 +55,19 @@ def objective_rows(begin, end, method, field, weight, plane_slope, value, gradie
             if size == 3:
                 mirror_up(info, 3)
                 if not invert(info, q3):
-                    value[i] = np.nan
+                    total = np.nan
                     break
-                value[i] += weigh_position(method, q3, jac[r], weighed)
-                add_gradient(r, 3, weight, row, u, inverse, arm, weighed, gradient[i])
+                total += weigh_position(method, q3, jac[r], weighed)
+                add_gradient(r, 3, weight, row, u, inverse, arm, weighed, gradient[site, i])
         if size == 6:
             mirror_up(info, 6)
-            if not invert_spd(info, 6, cov):
-                value[i] = np.nan
-                continue
-            value[i] = weigh_rotation(cov, rot[i], weighed)
-            for r in range(n_receiver):
-                add_gradient(r, 6, weight, row, u, inverse, arm, weighed, gradient[i])
+            if invert_spd(info, 6, cov):
+                total = weigh_rotation(cov, rot[i], weighed)
+                for r in range(n_receiver):
+                    add_gradient(r, 6, weight, row, u, inverse, arm, weighed, gradient[site, i])
+            else:
+                total = np.nan
+        value[site, i] = total
 
 
 @kernel

@@ -16,16 +16,9 @@ import numpy.typing as npt
 from rfpose.checks import FloatArray, as_float_array, read_only
 from rfpose.errors import InvalidInputError
 from rfpose.layout.maps import PosedMirrors
+from rfpose.layout.optimise.problem import TowerProblem, draw_places, problem_of, statistic_of
 from rfpose.layout.optimise.rules import Constraints, Costs
-from rfpose.layout.optimise.search import (
-    FEASIBLE,
-    Placement,
-    Progress,
-    TowerProblem,
-    draw_places,
-    problem_of,
-    statistic_of,
-)
+from rfpose.layout.optimise.search import FEASIBLE, Placement, Progress
 
 __all__ = ["Measure", "exchange", "measured"]
 
@@ -42,7 +35,7 @@ _NEAR = 0.15
 def measured(measure: Measure, transmitter_enu_m: npt.ArrayLike, statistic: str) -> float:
     """Return rms, worst or percentile over the field of what a measure says of transmitters (transmitter, xyz)."""
     place = as_float_array("transmitter_enu_m", transmitter_enu_m, ("transmitter", 3))
-    return statistic_of(measure(place), statistic, smooth=False)[0]
+    return float(statistic_of(measure(place), statistic, smooth=False)[0])
 
 
 def exchange(
@@ -132,7 +125,7 @@ def _meets(problem: TowerProblem, site: FloatArray) -> bool:
     new = site[len(problem.existing) :]
     inside = bool(np.all((new[:, 2] >= low) & (new[:, 2] <= high)))
     stays = np.allclose(site[: len(problem.existing)], problem.existing)
-    return inside and stays and bool(problem.margins(new.ravel() / problem.scale).min() >= -FEASIBLE)
+    return inside and stays and bool(problem.margins(new.reshape(1, -1) / problem.scale)[0].min() >= -FEASIBLE)
 
 
 def _other_places(

@@ -106,21 +106,29 @@ class Sightlines:
         above = self.start_enu_m[:, 2] + part * along[:, 2] - tower_enu_m[:, None, 2]
         return np.linalg.norm(gap, axis=2), above, np.where((part > 0.0) & (part < reach), part, np.nan), gap
 
-    def margin(self, tower_enu_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return by how much each tower (tower, xyz) is clear of the worst line [m], and its slope (tower, xyz).
+    def margin(self, tower_enu_m: FloatArray) -> FloatArray:
+        """Return by how much each tower (tower, xyz) is clear of the worst line [m]; negative: it stands in the way."""
+        aside, above, _, _ = self._clear(tower_enu_m)
+        return np.asarray(np.maximum(aside, above).min(axis=1) - self.clearance_m)
 
-        Negative: it stands in the way.
+    def margins(self, tower_enu_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return by how much each tower is clear of its worst lines (tower, line) [m], and the slopes (…, xyz).
+
+        Of several that are as near, since a tower among them leaves one only to come into the next; else of one, again.
         """
         aside, above, part, gap = self._clear(tower_enu_m)
         clear = np.maximum(aside, above) - self.clearance_m
-        rows, worst = np.arange(len(tower_enu_m)), np.argmin(clear, axis=1)
+        rows = np.arange(len(tower_enu_m))[:, None]
+        worst = np.argsort(clear, axis=1)[:, :_WORST_LINES]
+        is_alike = clear[rows, worst] < clear[rows, worst[:, :1]] + _ALIKE * self.clearance_m
+        worst = np.where(is_alike, worst, worst[:, :1])
         along = (self.end_enu_m - self.start_enu_m)[worst]
-        beside = (aside >= above)[rows, worst][:, None]
-        flat = gap[rows, worst] / np.maximum(aside[rows, worst], 1e-12)[:, None]
+        beside = (aside >= above)[rows, worst][..., None]
+        flat = gap[rows, worst] / np.maximum(aside[rows, worst], 1e-12)[..., None]
         # where the tower is nearest to an end of the line, its height does not change with the place
-        steep = along[:, 2] / np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-18)
-        rise = np.where(np.isfinite(part[rows, worst]), steep, 0.0)[:, None] * along[:, :2]
-        slope = np.column_stack([np.where(beside, flat, rise), np.where(beside[:, 0], 0.0, -1.0)])
+        steep = along[..., 2] / np.maximum((along[..., :2] ** 2).sum(axis=-1), 1e-18)
+        rise = np.where(np.isfinite(part[rows, worst]), steep, 0.0)[..., None] * along[..., :2]
+        slope = np.concatenate([np.where(beside, flat, rise), np.where(beside, 0.0, -1.0)], axis=-1)
         return clear[rows, worst], slope
 
     def crossed(self, tower_enu_m: FloatArray) -> int:
@@ -129,6 +137,9 @@ class Sightlines:
         return int((np.maximum(aside, above) < self.clearance_m - _TOUCH_M).any(axis=0).sum())
 
 
+_WORST_LINES = 3
+_ALIKE = 0.005
+"""Of so many lines of sight a search keeps each tower clear at once, where they are as near but for this share."""
 _TOUCH_M = 1e-3
 """A tower that stands in a line by less only touches it; places are written in round numbers."""
 

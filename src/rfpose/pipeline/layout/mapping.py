@@ -13,7 +13,6 @@ from rfpose.checks import FloatArray
 from rfpose.drawing import WIDTH_INCH, angle_unit, new_figure
 from rfpose.errors import ScenarioError
 from rfpose.layout import maps
-from rfpose.layout.budget import noise_bound, working_point
 from rfpose.layout.maps import ESTIMATORS, NormalsStudy, summarise
 from rfpose.layout.sensitivity import TransmitterSensitivity, transmitter_sensitivity
 from rfpose.layout.sight import visible
@@ -334,6 +333,8 @@ def _lacks(scenario: Scenario, name: str, sight: Sight | None) -> str:
 
 def _with_reflection(scenario: Scenario, posture: FieldPosture, tone_snr_db: float | None) -> FloatArray:
     """(heliostat,) bound of the scenario's own solver when it also estimates the ground's coefficient [rad]."""
+    from rfpose.layout.budget import noise_bound, working_point
+
     snr = {} if tone_snr_db is None else {"tone_snr_db": tone_snr_db}
     return noise_bound(working_point(scenario.changed(budget={"ground": "estimated"}, simulation=snr), posture.mirrors))
 

@@ -27,7 +27,6 @@ from rfpose.layout.optimise import (
 )
 from rfpose.measurement import noise_of
 from rfpose.multilat.normal import MAX_SIGMA_RAD
-from rfpose.pipeline.layout.mapping import layout_map
 from rfpose.pipeline.layout.site import (
     Field,
     FieldPosture,
@@ -41,7 +40,6 @@ from rfpose.pipeline.layout.site import (
 )
 from rfpose.pipeline.layout.text import edited
 from rfpose.pipeline.pictures.plan import draw_mirrors, draw_site, finish_plan
-from rfpose.pipeline.site import check_site_solvable, forecast_normals
 from rfpose.scenario import Box, Heliostat, PositionForm, Scenario, naming, read_positions
 from rfpose.shown import Shown, number
 from rfpose.tables import Tabled
@@ -388,6 +386,8 @@ class _Task:
 
     def site_variance(self, transmitter_enu_m: FloatArray) -> FloatArray:
         """(posture × heliostat,) what pose ``site`` would state [rad²]; of a mirror it cannot solve, the most."""
+        from rfpose.pipeline.site import forecast_normals
+
         moved = self.scenario.with_transmitters(transmitter_enu_m)
         sigma = [
             forecast_normals(moved, np.concatenate([p.mirrors.rot_enu_from_mirror, p.plate_rot])).sigma_rad
@@ -420,6 +420,8 @@ def _task(
             )
         studied = tuple(postures_of(scenario, postures))
         if criterion == SITE:
+            from rfpose.pipeline.site import check_site_solvable
+
             check_site_solvable(scenario)
     return _Task(
         scenario=scenario, postures=studied, field=stacked([p.mirrors for p in studied]),
@@ -600,6 +602,8 @@ def _drawn(curve: SitePlacements) -> Figure:
 
 
 def _before_and_after(found: SitePlacement) -> Figure:
+    from rfpose.pipeline.layout.mapping import layout_map
+
     shown = [layout_map(site, estimators=[_estimator(found)]) for site in (found.site, found.scenario)]
     is_dop = found.placement.criterion == "pdop"
     values = [each.pdop if is_dop else each.rms_mrad[_estimator(found)] for each in shown]
