@@ -64,6 +64,18 @@ def test_gusts_excited_by_one_number_have_the_same_covariances(speed, interval, 
     )
 
 
+def test_gusts_are_drawn_by_that_kick():
+    process = gust_process(4.0, interval_s=1.0, size_m=2.0)
+    transition, _, seen = gusts_apart(process)
+    state = process.start(np.random.default_rng(1), 3)
+    foreseen, noise = state.copy(), np.random.default_rng(2).standard_normal((3, 50))
+    found = process.run(state, np.random.default_rng(2), 50)
+    for t in range(50):
+        foreseen = foreseen @ transition.T + noise[:, t, None] * process.kick_mps
+        np.testing.assert_allclose(found[:, t], foreseen @ seen, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(state, foreseen, rtol=1e-9, atol=1e-12)
+
+
 def test_what_nothing_excites_stays():
     assert not one_kick(np.diag([0.5, 0.9]), np.zeros((2, 2)), np.ones(2)).any()
     assert not steady_root(np.diag([0.5, 0.9]), np.zeros(2)).any()
