@@ -271,7 +271,7 @@ def _cache_class() -> Any:
 def _bitcode_left_for_later(codegen: Any) -> Iterator[None]:
     """While it lasts, compiled code is loaded without the bitcode by which it is compiled into other kernels.
 
-    Few processes compile any, and reading it takes half of a kernel's loading.
+    Few processes compile any, and reading it takes about as long as all else of a kernel's loading.
     """
     before, codegen._library_class = codegen._library_class, _library_class()
     try:

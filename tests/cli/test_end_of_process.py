@@ -59,6 +59,12 @@ def test_an_unexpected_error_is_shown():
     assert "AttributeError" in errors
 
 
+def test_streams_that_were_closed_from_the_start_are_passed_over():
+    """As under a service or `>&-`: Python has None in their place."""
+    code, _, errors = ended(3, before="sys.stdout = None")
+    assert (code, errors) == (3, "")
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /dev/full")
 def test_what_cannot_be_printed_is_still_an_error():
     command = [sys.executable, "-c", PROGRAM.format(code=0, before="")]

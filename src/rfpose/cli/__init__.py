@@ -19,16 +19,16 @@ __all__ = ["main", "run"]
 def run() -> None:
     """Entry point of the ``rfpose`` command: `main`, after which the process ends without taking itself to pieces.
 
-    Python would first give back, one by one, all that libraries made: 0.2 s of processor time, for nothing. What
-    is to be done at the end is done: files are closed, threads waited for, functions of `atexit` called. Only where
-    somebody else registered one of those before (a profiler, say), Python ends as it always does.
+    Python would first give back, one by one, all that libraries made, which takes long and serves nobody. What is to be
+    done at the end is done: files are closed, threads waited for, functions of `atexit` called. Only where another
+    registered one of those before (a profiler, say), Python ends as it always does.
     """
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")  # its threads sleep when idle; else they spin for long
     ended: list[int] = []
 
     def leave() -> None:
         with contextlib.suppress(OSError, ValueError):  # what a closed pipe did not take is left to Python
-            for stream in (sys.stdout, sys.stderr):
+            for stream in filter(None, (sys.stdout, sys.stderr)):  # one that was closed from the start is None
                 stream.flush()
             if ended:
                 os._exit(ended[0])
